@@ -99,15 +99,16 @@ def find_stripes(
     least = math.log(options.min_likelihood / (1.0 - options.min_likelihood))
     size_px = width, frame.luma.shape[0]
     line = continued(found, log_odds, least, options.min_length_share * width, size_px)
-    parts: dict[int, list[StripePixels]] = {}
+    lines: dict[int, list[StripePixels]] = {}
     first = 0
     for segments in found:
         here = slice(first, first + len(segments.start) - 1)
         keep = line[here] >= 0
-        for of, chain in zip(line[here][keep], extended(segments, keep), strict=True):
-            parts.setdefault(int(of), []).append(_pixels_of(segments.search, segments.peaks, chain))
+        for number, chain in zip(line[here][keep], extended(segments, keep), strict=True):
+            points = _pixels_of(segments.search, segments.peaks, chain)
+            lines.setdefault(int(number), []).append(points)
         first = here.stop
-    stripes = _concatenated([chain for of in parts.values() for chain in _unless_blob(of)])
+    stripes = _concatenated([chain for one in lines.values() for chain in _unless_blob(one)])
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 

@@ -281,7 +281,7 @@ def _weights(channels: tuple[Channel, ...], offset_s: float) -> list[FloatArray]
 def _normal_equation(
     channels: tuple[Channel, ...], offset_s: float, weights: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the terms (n,) of each sample in the gradient and the curvature of the cost.
+    """Return the terms (n,) of each sample in the negative gradient and in the curvature.
 
     The derivative of a residual by the offset is the gain times the slope of the logged rate.
     """
