@@ -117,6 +117,7 @@ def print_board(request: BoardRequest, echo: Echo) -> None:
 
 
 def _print_squares(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
+    """Write the file of a board; return its page and notes."""
     board = _board(request)
     border = _MM * board.border
     width, height = (_MM * side + 2.0 * border for side in board.size)
@@ -129,6 +130,7 @@ def _print_squares(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], li
 
 
 def _board(request: BoardRequest) -> Board:
+    """Return the board of a request, with defaults for what is left out."""
     squares = (request.squares_x or 11, request.squares_y or 8)
     square = request.square_mm or _largest_square(request, squares)
     border = _BORDER_SHARE * square if request.border_mm is None else request.border_mm
@@ -179,6 +181,7 @@ def _smallest_dictionary(n_markers: int) -> str:
 
 
 def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
+    """Write the file of a box; return its pages and notes."""
     plan = BoxPlan(
         width=request.width_mm / _MM,
         height=request.height_mm / _MM,
@@ -199,6 +202,7 @@ def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[s
 
 
 def _patch_page(request: BoardRequest, plan: BoxPlan, patch: SheetPatch) -> PdfPage:
+    """Return the page of one sheet of markers for a plane of the box."""
     width, height = _MM * patch.size[0], _MM * patch.size[1]
     paper = best_paper(request.paper, width, height, f"a sheet of plane {patch.plane}")
     rectangles = [
@@ -216,6 +220,7 @@ def _patch_page(request: BoardRequest, plan: BoxPlan, patch: SheetPatch) -> PdfP
 
 
 def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
+    """Write the file of a plate; return its page and notes."""
     columns, rows = request.squares_x or 3, request.squares_y or 2
     size = request.marker_mm or 12.0
     family = request.dictionary or "DICT_APRILTAG_36h11"

@@ -296,6 +296,7 @@ def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
 
 
 def _matching_paths(argument: str) -> list[Path]:
+    """Return the pictures that one argument names: a file, a folder or a pattern."""
     path = Path(argument)
     if path.is_dir():
         found = [one for one in path.iterdir() if is_image_name(one)]
@@ -532,6 +533,7 @@ def _read(path: Path, flags: int) -> Image:
 
 
 def _common_size(names: Sequence[object], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Return the size of all pictures; refuse the first one of another size than most."""
     usual = max(set(sizes), key=sizes.count)
     for name, size in zip(names, sizes, strict=True):
         if size != usual:

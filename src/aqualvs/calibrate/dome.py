@@ -304,6 +304,7 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
 
 
 def _place_card(rig: Rig, sigmas: Mapping[str, float]) -> Card:
+    """Return the card with the position of lens or port."""
     if rig.flat_port is not None:
         return Card(
             "flat port",

@@ -89,6 +89,7 @@ def read_colmap(text: str, source: str, *, name: str | None = None) -> ForeignCa
 
 
 def _row(words: Sequence[str], n_line: int) -> _Row:
+    """Split one camera's line; a later version's word before the port is dropped."""
     if len(words) < 5:
         raise RigError(
             f"line {n_line}: has {len(words)} values; a camera is CAMERA_ID MODEL WIDTH HEIGHT and "
@@ -101,6 +102,7 @@ def _row(words: Sequence[str], n_line: int) -> _Row:
 
 
 def _lens(row: _Row, place: str) -> Lens:
+    """Return the lens of a camera's line."""
     if row.model not in _MODELS:
         raise RigError(
             f"{place} has the model {shown(row.model)}, which aqualvs lacks; use one of "
@@ -117,6 +119,7 @@ def _lens(row: _Row, place: str) -> Lens:
 
 
 def _port(words: Sequence[str], place: str) -> ForeignHousing:
+    """Return the housing by the words after the lens's parameters."""
     model = words[0]
     if model not in _PORTS:
         raise RigError(

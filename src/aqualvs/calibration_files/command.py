@@ -209,6 +209,7 @@ def _with_size(camera: ForeignCamera, request: ImportRequest) -> ForeignCamera:
 
 
 def _remarks(rig: Rig, *, dropped: bool) -> list[str]:
+    """Return lines on what was imported, left out and assumed."""
     lens = rig.lens
     lines = [
         f"camera: {lens.model}, {len(lens.distortion)} distortion coefficients, "
@@ -254,6 +255,7 @@ def run_export(request: ExportRequest, echo: Echo) -> None:
 
 
 def _left_out(rig: Rig, to: str) -> list[str]:
+    """Return the parts of a rig that a format cannot represent."""
     refractive = to == "colmap-underwater"
     housing = "dome" if rig.dome else "flat port" if rig.flat_port else ""
     names = []

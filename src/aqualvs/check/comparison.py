@@ -126,6 +126,7 @@ def rig_difference(
 
 
 def _camera_changes(new: Rig, old: Rig) -> dict[str, float]:
+    """Return the changes of pose, housing, media and intrinsics that both rigs have, by name."""
     names: tuple[str, ...] = POSE_PARAMETERS
     if new.housing is not None and type(new.housing) is type(old.housing):
         names += (*new.housing.numbers(), "n_air", "n_water")
@@ -450,6 +451,7 @@ def _part(
     matters: bool,
     unchanged: str = "stayed",
 ) -> ComparedPart:
+    """Return the change of a part, by the covariance or else by whether it `matters`."""
     moved = difference.has_moved(names)
     return ComparedPart(
         name=name,
@@ -545,6 +547,7 @@ def _is_same_plane(one: Laser, other: Laser) -> bool:
 
 
 def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:
+    """Return the table of all numbers that both rigs have."""
     names = ("number", "old", "new", "change", "sigma", "in sigmas")
     table = number_table(None, *names, texts=["number"])
     values, values_before = rig_numbers(new), rig_numbers(old)

@@ -99,6 +99,7 @@ def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> I
 def _ardusub(
     link: MavlinkLink, vehicle: VehicleSetup, working_range: tuple[float, float] | None
 ) -> Iterator[Finding]:
+    """Listen to an ArduSub for a while; yield findings on modes, messages and parameters."""
     began_s = time.monotonic()
     before = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
     parameters = link.read_parameters((*FOR_STICKS, *FOR_DISTANCE), timeout_s=_LISTEN_S)
@@ -232,6 +233,7 @@ def _with_fault(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
 
 
 def _machine() -> Iterator[Finding]:
+    """Yield findings on cores, disk space and the cache of compiled kernels."""
     cores = os.cpu_count() or 1
     text = f"Python {platform.python_version()}, {platform.machine()}, {cores} cores"
     yield Finding(Severity.OK if cores > 1 else Severity.WARN, text)
@@ -247,6 +249,7 @@ def _machine() -> Iterator[Finding]:
 
 
 def _packages() -> Iterator[Finding]:
+    """Yield a finding for each optional extra of the package."""
     for extra, (packages, purpose) in _EXTRAS.items():
         missing = [name for name in packages if not _installed(name)]
         if missing:
@@ -277,6 +280,7 @@ def _pipeline() -> Iterator[Finding]:
 
 
 def _speed(rig: Rig, frames: list[Frame]) -> Finding:
+    """Measure the frames of the bundled dive; return a finding on postures and time."""
     began = time.perf_counter()
     scanner = Scanner(rig)
     scanner.process(frames[0])
@@ -374,6 +378,7 @@ def _received(where: str) -> tuple[list[Frame], float, str, AqualvsError | None]
 
 
 def _fit(rig: Rig, frames: list[Frame]) -> Finding:
+    """Return a finding on whether the frames fit the rig and give postures."""
     height, width = frames[-1].luma.shape
     if (width, height) != rig.size_px:
         need = "x".join(map(str, rig.size_px))

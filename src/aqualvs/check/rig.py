@@ -88,6 +88,7 @@ def age_text(date: datetime, now: datetime) -> str:
 
 
 def _step_summary(name: str, step: SolvedStep, now: datetime) -> Finding:
+    """Return a finding on age, size and residual of a calibration step."""
     verb = "were" if name == "lasers" else "was"
     sentence = (
         f"The {name} {verb} calibrated {age_text(step.date, now)} from "
@@ -105,6 +106,7 @@ def _step_summary(name: str, step: SolvedStep, now: datetime) -> Finding:
 
 
 def _step_warnings(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
+    """Yield warnings on an implausible, old or too small calibration step."""
     days, old_days = (now - step.date).days, 365
     if days < -1:
         yield Finding.warn(
@@ -288,6 +290,7 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
 
 
 def _check_lens(rig: Rig) -> Iterator[Finding]:
+    """Yield findings on the lens's position, principal point and focal lengths."""
     distance, port = float(np.linalg.norm(rig.dome_from_cam.translation)), rig.flat_port
     if port is not None:
         tilt = math.degrees(math.acos(math.cos(port.tilt_x) * math.cos(port.tilt_y)))
@@ -327,6 +330,7 @@ def _check_lens(rig: Rig) -> Iterator[Finding]:
 
 
 def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
+    """Yield findings on the camera's direction and field of view."""
     axis = rig.dome_from_cam.rotation[:, 2]
     off = math.degrees(math.acos(min(max(float(axis[1]), -1.0), 1.0)))
     if off >= 90.0:
@@ -375,6 +379,7 @@ def _water_name(n: float) -> str:
 
 
 def _check_index(rig: Rig) -> Finding:
+    """Return a finding on whether the water's index is observable."""
     sigma = index_sigma(rig)
     if rig.flat_port is not None:
         return Finding.ok(
@@ -407,6 +412,7 @@ def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
 
 
 def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
+    """Return a finding on where a laser's stripe is visible within the working range."""
     near, far = rig.working_range
     # Least distance of the plane from the lens, in metres: nearer, one pixel is hundreds of
     # millimetres of range at 0.6 m.
@@ -458,6 +464,7 @@ def _angle_deg(a: Laser, b: Laser) -> float:
 
 
 def _check_pair(a: Laser, b: Laser) -> Finding:
+    """Return a finding on the angle between two lasers."""
     cosine = float(a.plane.normal @ b.plane.normal)
     angle = _angle_deg(a, b)
     pair = f"Lasers '{a.name}' and '{b.name}'"

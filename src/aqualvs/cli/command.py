@@ -165,6 +165,7 @@ class CheckedCommand(TyperCommand):
             raise
 
     def _refuse_empty(self, ctx: Any, args: Sequence[str]) -> None:
+        """Raise `OptionError` for an empty argument or value of an option."""
         if any(word == "" or word.endswith("=") for word in args):
             found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
             for parameter in self.params:
@@ -269,6 +270,7 @@ def _remedy(error: Mapping[str, Any]) -> str:
 
 
 def _check(value: Any, name: str) -> None:
+    """Raise `OptionError` for a value that is wrong for any parameter."""
     max_integer = 2**31 - 1
     if isinstance(value, float) and not math.isfinite(value):
         raise OptionError(f"{name} {value:g}: give a finite number")

@@ -120,6 +120,7 @@ def _listed(text: str | None, between: str, name: str, count: int, option: str) 
 
 
 def _split(text: str | None, between: str, count: int, option: str) -> list[float | int]:
+    """Return the numbers of an option's value, integers as such; empty if not given."""
     if text is None:
         return []
     from aqualvs.errors import OptionError

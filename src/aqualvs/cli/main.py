@@ -277,6 +277,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _exit_code(arguments: Sequence[str] | None) -> int:
+    """Run the program; print an expected error in one line and return the exit code."""
     try:
         listed = None if arguments is None else list(arguments)
         code = app(args=listed, prog_name="aqualvs", standalone_mode=False)

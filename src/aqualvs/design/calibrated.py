@@ -228,6 +228,7 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
 
 
 def _cost(rig: Rig, offset: float, ranges: Sequence[float]) -> OffsetCost:
+    """Return the errors of a lens offset by `offset` metres, forward and to the right."""
     centred = _with_lens(rig, (0.0, 0.0, 0.0))
     ahead, aside = _with_lens(rig, (0.0, offset, 0.0)), _with_lens(rig, (offset, 0.0, 0.0))
     return OffsetCost(

@@ -170,6 +170,7 @@ def _print_errors(
 
 
 def _requested_design(request: DesignRequest) -> Design:
+    """Return the design of the rig file, the design file or the example, with the given values."""
     if request.rig is not None:
         if request.design is not None:
             raise OptionError("give either a design file or --rig, not both")

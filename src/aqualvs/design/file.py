@@ -266,6 +266,7 @@ def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
 
 
 def _design(file: DesignFile, folder: Path) -> Design:
+    """Return the design of a checked file; `folder` is that of rig files it names."""
     near, far = (value / _MM for value in file.working_range_mm)
     fault = range_fault(*file.working_range_mm)
     if fault:
@@ -300,6 +301,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
 
 
 def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], Shutter]:
+    """Return lens, picture size and shutter, of a rig file or for a field of view."""
     given = AT_ONCE if camera.shutter is None else shutter_from_part(camera.shutter)
     if camera.rig is not None:
         if camera.width_px or camera.height_px or camera.fov_deg:
@@ -329,6 +331,7 @@ def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], 
 
 
 def _mounts(file: DesignFile) -> tuple[Mount, ...]:
+    """Return the mounts: evenly spaced around the dome, or one by one."""
     lasers, mounts = file.lasers, file.mounts
     if (lasers is None) == (mounts is None):
         raise OptionError("write either 'lasers' (evenly round the dome) or 'mounts' (one by one)")
@@ -348,6 +351,7 @@ def _mounts(file: DesignFile) -> tuple[Mount, ...]:
 
 
 def _mount(part: MountPart) -> Mount:
+    """Return one mount; a missing tilt is free, a missing stripe direction tangential."""
     x, y, z = (value / _MM for value in part.position_mm)
     given = part.stripe_deg
     stripe = math.radians(given) % math.pi if isinstance(given, float | int) else None

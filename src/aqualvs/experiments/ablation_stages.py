@@ -257,6 +257,7 @@ def _run_filters(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _see(laboratory: Laboratory, net: str) -> _Seen:
+    """Evaluate the adaptive filter and all sets of the paper's on one net."""
     scenario = nets_at_ranges(net)
     frames = tuple(range(scenario.n_frames))
     dive = laboratory.dive(scenario, point_frames=frames)

@@ -345,6 +345,7 @@ def _nothing(n: int) -> Answers:
 
 
 def _from_folder(folder: Path, benchmark: BenchmarkSet) -> dict[str, Answers]:
+    """Read the answers from one file for each dive."""
     found = {}
     for dive in benchmark.dives:
         for path in (folder / f"{dive.name}.csv", folder / dive.name / _RUN_FILE):
@@ -356,6 +357,7 @@ def _from_folder(folder: Path, benchmark: BenchmarkSet) -> dict[str, Answers]:
 
 
 def _from_file(path: Path, benchmark: BenchmarkSet) -> dict[str, Answers]:
+    """Read the answers from one file with a column `dive`."""
     rows = read_rows(path, ("dive", "frame", *_ANSWER))
     of_dive: dict[str, list[tuple[int, Row]]] = {dive.name: [] for dive in benchmark.dives}
     for i, row in enumerate(rows):

@@ -230,6 +230,7 @@ def frames_of(dive: RenderedDive) -> list[Frame]:
 
 
 def _measured(dive: RenderedDive, scanner: Scanner, frame_s: list[float]) -> MeasuredDive:
+    """Measure all frames of a dive; append the scanner's times to `frame_s`."""
     scans = []
     with open_source(str(dive.video)) as source:
         for frame in source:
@@ -418,6 +419,7 @@ def _stored_files(folder: Path) -> CalibrationFiles:
 
 
 def _calibrate(files: CalibrationFiles, rig: Path, n_lasers: int) -> None:
+    """Calibrate camera, dome and lasers by the commands, and write `rig`."""
     # The last step writes `rig`, which exists only if all steps have succeeded.
     draft = rig.with_name(_DRAFT)
     camera = CameraRequest(

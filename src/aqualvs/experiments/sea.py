@@ -260,6 +260,7 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _dive(laboratory: Laboratory) -> tuple[_PartlyRendered, LoopLog]:
+    """Simulate the descent; return the sensor with its scans, and the log."""
     net = NetWall(curvature=-1.0 / 20.0, sway=0.04, sway_period=9.0, rock=math.radians(3.0))
     model = vehicle_model("bluerov2")
     sea_seed = 22

@@ -124,6 +124,7 @@ def _stopping(
 def _simulate_calibration(
     rig_file: Path | None, out: Path, echo: Echo, *, camera: SimulatedCamera, overwrite: bool
 ) -> int:
+    """Render the pictures of a calibration and print the commands that use them."""
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     # In the order in which they are rendered.
     folders = ("camera_air", port_folder(rig), "box", "index", "dive")

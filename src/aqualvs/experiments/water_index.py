@@ -254,6 +254,7 @@ def decentred(rig: Rig, lens_mm: Sequence[float] = _SETUP.decentred_mm) -> Decen
 
 
 def _projected(rig: Rig) -> list[View]:
+    """Return noisy frames of the plate in front of a rig, without rendering."""
     points = targets.plate_before(rig, _SETUP.plate_far).corners().reshape(-1, 3)
     pixels, _ = rig.camera().project(points)
     rng = np.random.default_rng(_SETUP.seed)

@@ -330,6 +330,7 @@ def run_simulation(request: SimRequest, echo: Echo) -> int:
 def _case(
     request: SimRequest, limits: SafetyLimits, setpoint: Setpoint, shutter: Shutter
 ) -> SimCase:
+    """Return the simulated run of a request."""
     timing = Timing(fps=request.fps)
     if shutter.is_interlaced:
         timing = Timing(fps=2.0 * request.fps, field=shutter.readout)

@@ -248,6 +248,7 @@ class SimulatedLoop:
     def _step(
         self, now_s: float, frame_s: float, filter_s: float, posture: Posture | Refusal
     ) -> None:
+        """Step time filter and pilot, and send the effort; `filter_s` is the filter's time."""
         self.filtered = self._filter.update(filter_s, posture)
         state = self.link.state()
         decision = self._decision = self.steering.step(
@@ -267,6 +268,7 @@ class SimulatedLoop:
         self.link.send(effort)
 
     def _row(self, now_s: float, posture: Posture | Refusal | None) -> LoopRow:
+        """Return the row of the log for the present state."""
         vehicle, decision, seen = self.link.vehicle, self._decision, self.filtered
         truth = self.net.posture_at(vehicle.dome_pose, now_s)
         state = self.link.state()

@@ -93,6 +93,7 @@ class RenderedSensor:
         return scan.posture
 
     def _render(self, time_s: float, field: Field | None) -> Planes:
+        """Render the picture, or one field of it, whose readout ends at a time."""
         shutter = self._scanner.rig.shutter
         middle_s = time_s - 0.5 * shutter.exposure
         if field is not None:
@@ -196,6 +197,7 @@ class SampledSensor:
         return self._last
 
     def _look(self, truth: NetPosture, time_s: float) -> Posture | Refusal | None:
+        """Return the result for a frame, by the period of blindness, the range and the noise."""
         # Always drawn: the noise of a frame does not depend on earlier frames.
         draws = self._rng.normal(size=3)
         wild = self._rng.uniform() < self._noise.outliers
@@ -218,6 +220,7 @@ class SampledSensor:
         return self._sample(truth, (10.0 if wild else 1.0) * draws)
 
     def _sample(self, truth: NetPosture, draws: FloatArray) -> Posture:
+        """Return the posture with standard normal `draws` (3,) times the noise."""
         noise = self._noise
         sigma = np.array([noise.range_share * truth.range, noise.pitch, noise.yaw])
         distance, pitch, yaw = (np.array(truth[:3]) + sigma * draws).tolist()

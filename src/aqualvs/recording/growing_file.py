@@ -243,6 +243,7 @@ class GrowingFile:
         return end
 
     def _count(self, chunk: Chunk, index: bytes) -> None:
+        """Add a written chunk to the statistics and to the index records to be written."""
         start_ns, end_ns = chunk.times_ns
         first_ns, last_ns = self._times_ns if self._n_chunks else chunk.times_ns
         self._times_ns = (min(first_ns, start_ns), max(last_ns, end_ns))

@@ -219,6 +219,7 @@ class Recorder:
         self._changed.notify()
 
     def _run(self) -> None:
+        """Write chunks until the recorder is closed; the body of the thread."""
         while (messages := self._next_chunk()) is not None:
             written = self._write(messages.seal())
             with self._changed:
@@ -257,6 +258,7 @@ class Recorder:
                 return False
 
     def _sync_if_due(self) -> None:
+        """Flush the file to the disk if the interval has passed."""
         every_s, now_s = self._options.sync_s, time.monotonic()
         if every_s is None or now_s - self._synced_s < every_s:
             return

@@ -124,6 +124,7 @@ class RerunLog(Closing):
             self._stream.disconnect()
 
     def _log_rig(self, rig: Rig) -> None:
+        """Log camera pose and pinhole; on the first call also colours and axes."""
         rr, lens, first = self._rr, rig.lens, self._rig is None
         self._rig = rig
         camera = rig.dome_from_cam
@@ -162,6 +163,7 @@ class RerunLog(Closing):
         self._stream.log(path, entity, static=True)
 
     def _log_posture(self, posture: Posture) -> None:
+        """Log the posture: series, vehicle, target and its sigma."""
         rr, normal = self._rr, posture.normal_in_dome
         self._silent = False
         sigma = np.sqrt(posture.total_covariance.diagonal())
@@ -184,6 +186,7 @@ class RerunLog(Closing):
         self._stream.log(f"{_PLANE}/sigma", rr.LineStrips3D(strips, colors=[_AMBER, _AMBER]))
 
     def _log_refusal(self, refusal: Refusal) -> None:
+        """Log the reason of a refusal and clear what has no value."""
         is_silence = refusal.reason is Reason.NO_FRAMES
         # A silent stream is reported ten times a second.
         if not (is_silence and self._silent):

@@ -179,6 +179,7 @@ def _next_record(data: bytes, start: int, lengths: Mapping[int, int]) -> int | N
 
 
 def _decode(octets: np.ndarray, at: np.ndarray, form: Format) -> dict[str, FloatArray]:
+    """Return the numeric columns of records of one format, at offsets `at`."""
     layout = form.dtype
     if layout is None:
         return {}
@@ -287,6 +288,7 @@ def read_dataflash_text(path: Path) -> VehicleLog:
 
 
 def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
+    """Return the vehicle log of decoded records."""
     tables = _first_core(records.tables)
     starts = [
         float(t["time_s"][0]) for name, t in tables.items() if name in ("ATT", "CTUN", "BARO")
@@ -348,6 +350,7 @@ def _first_core(tables: _Tables) -> _Tables:
 def _signal(
     tables: _Tables, begin: float, kind: str, column: str, scale: float = 1.0
 ) -> Signal | None:
+    """Return a scaled column as a signal, None if it is missing; `begin` is log time 0."""
     table = tables.get(kind)
     if table is None or column not in table:
         return None
@@ -361,6 +364,7 @@ def _signal(
 def _angle(
     tables: _Tables, begin: float, column: str, interpolation: Interpolation
 ) -> Signal | None:
+    """Return an angle of `ATT` as a signal in radians."""
     table = tables.get("ATT")
     if table is None or column not in table:
         return None
@@ -372,6 +376,7 @@ def _angle(
 
 
 def _depth(tables: _Tables, begin: float) -> tuple[Candidate | None, str | None]:
+    """Return the chosen depth, and a note on one that is stuck."""
     candidates = [
         Candidate(f"{kind}.{column}", _signal(tables, begin, kind, column, scale))
         for kind, column, scale in (
@@ -387,6 +392,7 @@ def _depth(tables: _Tables, begin: float) -> tuple[Candidate | None, str | None]
 
 
 def _barometer(tables: _Tables, begin: float) -> Candidate:
+    """Return the depth by the last barometer, which is the one in the water."""
     table = tables.get("BARO")
     if table is None or "Alt" not in table:
         return Candidate("BARO.Alt", None)
@@ -438,6 +444,7 @@ def _armed(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
 
 
 def _modes(tables: _Tables, begin: float) -> tuple[tuple[float, str], ...]:
+    """Return the times and names of flight modes."""
     table = tables.get("MODE")
     if table is None:
         return ()

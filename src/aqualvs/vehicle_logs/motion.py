@@ -132,6 +132,7 @@ def correlation_time(first: Rates, second: Rates) -> float:
 
 
 def _autocorrelation(rates: Rates, reach: int) -> FloatArray:
+    """Return the autocorrelation at lags 0 to `reach` - 1, over valid pairs."""
     values = rates.rate
     size = fft.next_fast_len(len(values) + reach, real=True)
     spectrum = np.abs(fft.rfft(values, size)) ** 2

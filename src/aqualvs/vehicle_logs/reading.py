@@ -79,6 +79,7 @@ def _rows(text: str, path: Path) -> list[tuple[int, list[str]]]:
 
 
 def _columns(names: list[str], path: Path) -> tuple[list[str], list[str]]:
+    """Check the header; return all names, and those of columns that are not read."""
     check_commas(names, path, SourceError)
     for name in names:
         if name in _COLUMNS and names.count(name) > 1:
@@ -139,6 +140,7 @@ def _table(
 
 
 def _number(name: str, cell: str, path: Path, line: int) -> float:
+    """Return the number in a cell, or seconds since 1970 for the column time; NaN if empty."""
     if name == "time":
         try:
             return utc_seconds(cell)
@@ -192,6 +194,7 @@ def _check_depths(depth_m: FloatArray, lines: list[int], path: Path) -> None:
 def _log(
     path: Path, table: dict[str, FloatArray], start_utc_s: float | None, notes: tuple[str, ...]
 ) -> VehicleLog:
+    """Return the vehicle log of a table; repeated times are left out."""
     time_s = table["time_s"]
     repeated = int(np.count_nonzero(np.diff(time_s) == 0.0))
     if repeated:
@@ -277,6 +280,7 @@ def _reader(head: bytes, path: Path) -> Callable[[Path], VehicleLog]:
 
 
 def _head(path: Path) -> bytes:
+    """Return the first bytes of a file, by which its format is recognised."""
     head_bytes = 65536
     try:
         with path.open("rb") as file:

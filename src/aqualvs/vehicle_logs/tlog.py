@@ -277,6 +277,7 @@ def _signal(
     scale: float = 1.0,
     interpolation: Interpolation = Interpolation.LINEAR,
 ) -> Signal | None:
+    """Return a scaled field of a message as a signal; None if it is missing."""
     table = tables.get(message)
     if table is None:
         return None
@@ -295,6 +296,7 @@ def _depth(tables: _Tables, clock: TelemetryClock) -> tuple[Candidate | None, st
 
 
 def _heading(tables: _Tables, clock: TelemetryClock) -> _Found:
+    """Return the heading from the best message that has it, and its source."""
     heading = _signal(tables, clock, "ATTITUDE", "yaw", interpolation=Interpolation.BEARING)
     if heading is not None:
         return heading, "ATTITUDE.yaw"
@@ -327,6 +329,7 @@ def _velocity(tables: _Tables, clock: TelemetryClock) -> _Found:
 def _armed_and_modes(
     tables: _Tables, clock: TelemetryClock
 ) -> tuple[Signal | None, tuple[tuple[float, str], ...]]:
+    """Return whether the vehicle is armed, and times and names of its flight modes."""
     table = tables.get("HEARTBEAT")
     if table is None:
         return None, ()

@@ -109,6 +109,7 @@ class Signal:
         return values, valid
 
     def _between(self, before: IndexArray, after: IndexArray, share: FloatArray) -> FloatArray:
+        """Interpolate between samples; `share` is 0 at `before` and 1 at `after`."""
         first: FloatArray = self.values[before]
         if self.interpolation is Interpolation.HELD:
             return first.copy()
