@@ -20,6 +20,7 @@ from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 from aqualvs.optics.water import N_AIR
+from aqualvs.schema import shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,11 +299,3 @@ def whole(value: float, place: str) -> int:
     if value != math.floor(value) or not 0 <= value <= largest:
         raise RigError(f"{place} is {value:g}; write a whole number of 0 or more")
     return int(value)
-
-
-def shown(value: object) -> str:
-    """Return a value as text of at most 60 characters."""
-    if isinstance(value, Mapping):
-        return "a mapping"
-    text = "empty" if value is None else repr(value)[:200]
-    return text if len(text) <= 60 else text[:57] + "..."

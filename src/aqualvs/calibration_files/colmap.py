@@ -24,7 +24,6 @@ from aqualvs.calibration_files.camera import (
     number,
     opencv_lens,
     padded,
-    shown,
     whole,
 )
 from aqualvs.calibration_files.kalibr import one_of
@@ -32,6 +31,7 @@ from aqualvs.errors import RigError
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.schema import shown
 
 # Position of the centre of the top-left pixel.
 _HALF = 0.5

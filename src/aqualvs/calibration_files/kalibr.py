@@ -6,10 +6,11 @@ The keys are those of Kalibr's wiki, "Yaml formats" and "Calibration targets". P
 from collections.abc import Mapping
 
 from aqualvs.calibration.targets.targets import Board, BoardKind
-from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded, shown
+from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded
 from aqualvs.calibration_files.opencv import plain_name
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.optics.lens import LensModel
+from aqualvs.schema import shown
 from aqualvs.yamlfile import parse_yaml, yaml_text
 
 # By distortion model: whether it is a fisheye, and its number of coefficients.

@@ -17,9 +17,10 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
-from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded, shown
+from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded
 from aqualvs.errors import RigError
 from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.schema import shown
 from aqualvs.yamlfile import parse_yaml, yaml_text
 
 # By distortion model of ROS: possible numbers of coefficients; image_geometry uses all of them.

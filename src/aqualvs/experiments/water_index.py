@@ -34,6 +34,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.report.figure_style import BLUE, GREY, OURS, PAPER, TRUTH
 from aqualvs.simulation import calibration_targets as targets
+from aqualvs.simulation.lasers import LUMA
 from aqualvs.simulation.panels import PanelRenderer, RoomLight
 from aqualvs.yamlfile import write_text, yaml_text
 
@@ -185,8 +186,7 @@ def _out_of_place(plate: targets.Marked) -> SE3:
 
 
 def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
-    # Weights of OpenCV's conversion from RGB to grey.
-    grey = np.asarray(np.rint(picture @ np.array([0.299, 0.587, 0.114])), np.uint8)
+    grey = np.asarray(np.rint(picture @ LUMA), np.uint8)
     view = detect_markers(grey, markers, name)
     if isinstance(view, str):
         raise CalibrationError(f"{name}: {view}")
