@@ -17,7 +17,7 @@ from rich.table import Table
 from scipy.special import chdtri, ndtr
 
 from aqualvs.calibration.solver.bundle import rig_difference as step_between
-from aqualvs.check.finding import escaped, number_table
+from aqualvs.check.finding import escaped, number_table, share_plane
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
@@ -531,19 +531,12 @@ def _old_names(new: Rig, old: Rig) -> dict[str, str]:
     gone = [laser for laser in old.lasers if laser.name not in shared]
     old_names = {}
     for laser in new.lasers:
-        twin = next((other for other in gone if _is_same_plane(laser, other)), None)
+        # Planes of different lasers are farther apart.
+        twin = next((other for other in gone if share_plane(laser, other)), None)
         if laser.name not in shared and twin is not None:
             gone.remove(twin)
             old_names[laser.name] = twin.name
     return old_names
-
-
-def _is_same_plane(one: Laser, other: Laser) -> bool:
-    """Return whether two planes are so near that most likely both are of the same laser."""
-    cosine = float(one.plane.normal @ other.plane.normal)
-    shift = one.plane.offset - math.copysign(1.0, cosine) * other.plane.offset
-    max_tilt, max_shift_m = math.radians(1.0), 5e-3
-    return abs(cosine) > math.cos(max_tilt) and abs(shift) < max_shift_m
 
 
 def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:

@@ -19,7 +19,7 @@ from aqualvs.optics.expected_error import (
     expected_posture_errors,
     in_mm_and_degrees,
 )
-from aqualvs.optics.rig import Rig, RigUncertainty
+from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.shutter import ShutterKind
 from aqualvs.text import Finding, Severity
 
@@ -47,6 +47,14 @@ def number_table(title: str | None, *columns: str, texts: Sequence[str] = ()) ->
 def escaped(text: str) -> str:
     """Return text in which Rich does not take square brackets for markup."""
     return text.replace("[", r"\[")
+
+
+def share_plane(one: Laser, other: Laser) -> bool:
+    """Return whether two laser planes differ by less than 1 degree and 5 mm."""
+    cosine = float(one.plane.normal @ other.plane.normal)
+    shift = one.plane.offset - math.copysign(1.0, cosine) * other.plane.offset
+    max_tilt, max_shift_m = math.radians(1.0), 5e-3
+    return abs(cosine) > math.cos(max_tilt) and abs(shift) < max_shift_m
 
 
 def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedError, ...]:

@@ -22,6 +22,7 @@ from aqualvs.check.finding import (
     findings_table,
     index_sigma,
     sensitivity_table,
+    share_plane,
     shutter_finding,
 )
 from aqualvs.errors import RigError
@@ -465,11 +466,9 @@ def _angle_deg(a: Laser, b: Laser) -> float:
 
 def _check_pair(a: Laser, b: Laser) -> Finding:
     """Return a finding on the angle between two lasers."""
-    cosine = float(a.plane.normal @ b.plane.normal)
     angle = _angle_deg(a, b)
     pair = f"Lasers '{a.name}' and '{b.name}'"
-    apart = abs(a.plane.offset - math.copysign(1.0, cosine) * b.plane.offset)
-    if angle < 1.0 and apart < 5e-3:
+    if share_plane(a, b):
         return Finding.bad(
             f"{pair} lie in one plane, so the two draw one line; check their normals."
         )
