@@ -105,7 +105,7 @@ def sea(
     wander : float
         Standard deviation of slow changes of the current, in m/s.
     waves : float
-        Amplitude at the surface, in metres; 0 for none. The vehicle is 5 m deep.
+        Amplitude at the surface, in metres; 0 for none. The net's origin is 5 m deep.
     period : float
         Period of the waves, in seconds.
     waves_to : float
