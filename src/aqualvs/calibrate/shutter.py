@@ -38,6 +38,7 @@ _NOMINAL = 0.02
 # Length in seconds of the parts of the dive whose scatter gives sigma: longer than errors of the
 # picture are correlated while a vehicle swings, and than the window of frames that gives a rate.
 _PART_S = 0.5
+# Fewest parts: the variance of Student's distribution needs more than three.
 _MIN_PARTS = 4
 # Fewest frames with a posture.
 _MIN_FRAMES = 50

@@ -189,6 +189,7 @@ def opencv_text(camera: ForeignCamera, suffix: str) -> str:
     return storage.releaseAndGetString()
 
 
+# By lens model of mrcal: number of distortion coefficients.
 _COUNTS = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}
 
 

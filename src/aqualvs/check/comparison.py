@@ -39,7 +39,7 @@ from aqualvs.text import sentence
 SIGNIFICANT = 5.0
 """Sigmas above which a change is significant."""
 
-# Rotations, in radians, below this are rounding: files keep fewer digits.
+# Largest rounding, in radians, of rotations that are read back from a file.
 _ROUNDING = 1e-12
 
 
@@ -79,8 +79,7 @@ class RigDifference:
         scaled, size = change[known] / size[known], size[known]
         correlation = covariance[np.ix_(known, known)] / np.outer(size, size)
         values, vectors = np.linalg.eigh(correlation)
-        # Least variance of a combination of numbers, as a share of their own variances: files round
-        # the covariance.
+        # No combination of numbers is taken to be known better than this share of their variances.
         min_value = 1e-4
         return float(np.linalg.norm(scaled @ vectors / np.sqrt(np.maximum(values, min_value))))
 

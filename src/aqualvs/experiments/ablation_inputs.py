@@ -168,8 +168,10 @@ SHEETS = Experiment(
 )
 
 
+# Errors of the assumed index.
 _INDEX_STEPS = (-0.010, -0.005, 0.0, 0.005, 0.010)
-# Beyond this the stripes of this strongly decentred lens no longer share a plane.
+# Errors of the assumed position: with larger ones, the stripes of this strongly decentred lens no
+# longer share a plane.
 _LENS_STEPS_MM = (-0.5, -0.25, 0.0, 0.25, 0.5)
 _AXES = ("right", "forward", "up")
 _COLOURS = (ORANGE, BLUE, GREEN)

@@ -40,6 +40,7 @@ from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.stripe import StripeOptions, ThresholdOptions
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 
+# Thresholds in grey levels, and the scenes besides the wall.
 _LEVELS = (100, 140, 180)
 _NETS = {"sun": "net in sun", "growth": "grown net"}
 

@@ -367,6 +367,7 @@ def _bars(axes: Axes, variants: Sequence[Variant], values: FloatArray, name: str
     axes.grid(visible=False, axis="y")
 
 
+# Numbers of pictures for the calibration.
 _SIZE = SetSize(camera=12, dome=10, box=4, index=1, dive=0)
 _CALIBRATED_RIG, _DRAFT, _RIG_READY = "rig.yaml", "draft.yaml", "pictures.json"
 

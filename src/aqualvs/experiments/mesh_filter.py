@@ -259,6 +259,7 @@ def mean_score(found: Sequence[PrecisionRecall]) -> PrecisionRecall:
     return PrecisionRecall(*means)
 
 
+# Frames that are evaluated.
 _JUDGED = (2, 8, 14, 20)
 
 

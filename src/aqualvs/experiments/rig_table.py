@@ -27,6 +27,7 @@ from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.sources.base import bgr_of
 from aqualvs.text import laser_colour
 
+# Distance of the point ahead by which refraction is stated, in metres.
 _FAR = 1.0
 
 _CAPTION = (

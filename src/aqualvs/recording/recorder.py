@@ -23,6 +23,7 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.sources import mcap_file
 from aqualvs.sources.base import PartHealth, State
 
+# Size of uncompressed messages at which a chunk is written before it is due.
 MAX_CHUNK_BYTES = 4 << 20
 
 

@@ -247,7 +247,7 @@ def _plausible(times: FloatArray) -> BoolArray:
     """Return the mask of times near those of their neighbours in the file."""
     if len(times) <= 2:
         return np.isfinite(times)
-    # Records have no checksum: damaged ones may have any time. Logging may pause for a while.
+    # Records have no checksum: times of damaged ones are far from the median of their neighbours.
     n_neighbours, max_deviation_s = 9, 10.0
     median = ndimage.median_filter(times, min(n_neighbours, len(times)), mode="nearest")
     near: BoolArray = np.isfinite(times) & (np.abs(times - median) <= max_deviation_s)
