@@ -2,6 +2,8 @@
 
 import gc
 import os
+import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -62,6 +64,23 @@ def pytest_configure(config: pytest.Config) -> None:
         from kernel_locks import compile_one_at_a_time
 
         compile_one_at_a_time()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Have one process import a file of tests, and the others find its byte code on disk.
+
+    Where there is none yet, making it is most of collecting: pytest rewrites every assertion.
+    """
+    if sys.platform == "win32" or not isinstance(collector, pytest.Module):
+        return (yield)
+    import fcntl
+
+    with collector.path.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        return (yield)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
