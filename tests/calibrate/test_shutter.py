@@ -19,7 +19,7 @@ from aqualvs.sources.images import ImageSource
 from whole import WHOLE
 
 FPS = 25.0
-N = 80 if WHOLE else 64
+N = 80 if WHOLE else 54
 
 
 def rig_with(shutter):
