@@ -17,6 +17,7 @@ from aqualvs.nets.target_file import NetRequest, net_request
 from aqualvs.results.folder import NET_FILES
 from aqualvs.results.run_request import scanner_options
 from batch_cases import DEMO, InlineWorkers, Listener, demo_dive, work_for
+from net_app_cases import leave_maps_blank
 
 BARE = NetRequest()
 
@@ -45,8 +46,9 @@ def told(tmp_path_factory, dive):
 
 
 @pytest.fixture
-def finished(tmp_path, told, dive):
-    """A copy of it."""
+def finished(tmp_path, told, dive, monkeypatch):
+    """A copy of it, of which no further map is drawn."""
+    leave_maps_blank(monkeypatch)
     folder = tmp_path / "season"
     # Links keep what two places of a batch share one file.
     shutil.copytree(told[0], folder)

@@ -19,6 +19,7 @@ from aqualvs.results.net_survey import NetPass, read_run
 from aqualvs.results.points import PointsStream
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net
+from net_app_cases import leave_maps_blank
 from net_cases import passing
 from shell_cases import rig_file, write_video
 
@@ -57,7 +58,12 @@ def scans():
 
 
 @pytest.fixture
-def run_folder(scans, tmp_path):
+def blank_maps(monkeypatch):
+    leave_maps_blank(monkeypatch)
+
+
+@pytest.fixture
+def run_folder(scans, tmp_path, blank_maps):
     """The first second and a half of it: enough for what is no matter of the net."""
     return write_run(tmp_path / "run", scans[:FEW])
 
@@ -182,6 +188,7 @@ def test_stopping_tells_of_what_came_before(run_folder, monkeypatch, capsys):
     assert int(rows(run_folder / "net.csv")[-1]["last_frame"]) == 20
 
 
+@pytest.mark.usefixtures("blank_maps")
 def test_a_killed_run_is_completed_first(scans, tmp_path, capsys):
     folder = write_run(tmp_path / "run", scans[:FEW])
     content = yaml.safe_load((folder / "run.yaml").read_text())
@@ -216,6 +223,7 @@ def test_a_dive_without_a_net_says_so(command, dive, tmp_path, capsys):
     assert not {path.name for path in out.iterdir()} & set(NET_FILES)
 
 
+@pytest.mark.usefixtures("blank_maps")
 def test_running_tells_the_same_as_evaluating_the_run(scans, tmp_path):
     """The files keep float32; that must not change what is found."""
     direct = tmp_path / "direct"

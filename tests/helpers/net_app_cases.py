@@ -1,6 +1,10 @@
 """Stretches, holes and dives along a net, made by hand for the tests of `aqualvs net`."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
+import pytest
 
 from aqualvs.nets.condition import NetStretch
 from aqualvs.nets.coverage import Twine
@@ -8,10 +12,25 @@ from aqualvs.nets.holes import Hole
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.places import DivePostures
 from aqualvs.nets.spectrum import Mesh
+from aqualvs.results.folder import NET_MAP_PNG, NET_MAP_SVG
 from aqualvs.vehicle_logs import Interpolation, Signal, VehicleLog
 
 STRETCH_S = 2.5
 """Length of the stretches made here."""
+
+
+def leave_maps_blank(patch: pytest.MonkeyPatch) -> None:
+    """Have the files of a net written with a white map: drawing it takes most of their time."""
+    blank = {
+        NET_MAP_PNG: cv2.imencode(".png", np.full((2, 2), 255, np.uint8))[1].tobytes(),
+        NET_MAP_SVG: b'<svg xmlns="http://www.w3.org/2000/svg"/>',
+    }
+
+    def draw(_wall: object, paths: list[Path]) -> None:
+        for path in paths:
+            path.write_bytes(blank[path.name])
+
+    patch.setattr("aqualvs.nets.map.draw_map", draw)
 
 
 def lattice(bar=0.025):

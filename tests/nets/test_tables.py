@@ -18,7 +18,7 @@ from aqualvs.results.folder import NET_FILES
 from aqualvs.results.net_survey import write_net_files
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.vehicle_logs import VehiclePlaces
-from net_app_cases import STRETCH_S, hole, postures, stretch, vehicle_log
+from net_app_cases import STRETCH_S, hole, leave_maps_blank, postures, stretch, vehicle_log
 from report_cases import make_dive
 
 N = 6
@@ -54,6 +54,12 @@ def folder(wall, tmp_path_factory):
     facts = {"summary": net_dict(wall, 1.5, 200, 190), "log": None}
     write_net_files(folder, wall, facts)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def blank_maps(folder, monkeypatch):
+    """That of the folder is drawn, and those that a test draws itself."""
+    leave_maps_blank(monkeypatch)
 
 
 def rows(path):
