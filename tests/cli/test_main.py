@@ -1,6 +1,5 @@
 """The command line as a whole: help, version, and how fast it is there."""
 
-import collections
 import contextlib
 import os
 import re
@@ -20,6 +19,7 @@ from aqualvs.cli.command import CheckedCommand
 from aqualvs.cli.main import main
 from aqualvs.errors import AqualvsError
 from shell_cases import rig_file
+from waiting import until
 
 COMMANDS = ("run", "simulate", "demo", "check", "report", "board")
 HEAVY = {"numpy", "numba", "cv2", "av", "pydantic", "pyarrow", "scipy", "rich", "yaml"}
@@ -175,7 +175,7 @@ def test_an_interrupt_while_llvm_compiles_is_neither_lost_nor_a_fault_of_the_com
         engine.finalize_object()
         assert compiled
         with pytest.raises(KeyboardInterrupt):
-            collections.deque(map(time.sleep, [0.01] * 3000))
+            until(lambda: False, "the interrupt")
     finally:
         signal.signal(signal.SIGINT, before)
 
