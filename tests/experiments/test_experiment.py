@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cached_property, partial, partialmethod
 
 import pytest
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from aqualvs.experiments import ablation_stages, growth_and_sun, page, sea, water_index
 from aqualvs.experiments.experiment import MODULES, experiment
@@ -54,9 +55,10 @@ def laboratory(tmp_path_factory):
 
 @pytest.fixture
 def plain_figures(monkeypatch):
-    """Figures in one format, coarsely: `test_command.py` writes others, and as they are."""
+    """Figures in one format, coarsely laid out: `test_command.py` writes others, as they are."""
     monkeypatch.setattr(page, "_FORMATS", {"png": {}})
     monkeypatch.setattr(page, "STYLE", {**STYLE, "savefig.dpi": 60})
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
 
 
 @pytest.fixture
