@@ -79,6 +79,13 @@ def test_a_flat_picture_is_refused():
     assert not refine_tags(image, np.array([5]), quads, _FAMILY).valid.any()
 
 
+def test_noise_of_a_tenth_of_the_contrast_is_no_other_marker():
+    image, truth = _shot(_PLAIN, noise=20.0, seed=3)
+    fit = refine_tags(image, np.array([5]), truth[None], _FAMILY)
+    assert fit.valid.all()
+    assert np.abs(fit.pixels[0] - truth).max() < 5.0 * fit.sigma.max()
+
+
 def test_the_sigma_of_a_corner_is_honest():
     scores = []
     for seed in range(16):

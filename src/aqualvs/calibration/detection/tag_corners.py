@@ -403,7 +403,7 @@ class _FitOptions(NamedTuple):
     # Noise of rounding to whole grey levels.
     min_noise: float = 0.3
     min_contrast: float = 8.0
-    max_residual_share: float = 0.06
+    max_residual_share: float = 0.15
     min_clean_share: float = 0.4
     max_sigma_px: float = 0.15
     max_wander_share: float = 0.1
