@@ -150,6 +150,14 @@ def test_ctrl_c_leaves_whole_folders_of_calibration_pictures(tmp_path):
     assert (out / "nominal.yaml").is_file()
 
 
+def test_a_camera_with_a_sensor_of_its_own_refuses_that_of_a_scenario(tmp_path, refused):
+    dive, out = tmp_path / "dive.yaml", tmp_path / "out"
+    dive.write_text("walls: [{}]\nsensor: {defocus_px: 3}\n")
+    said = refused("simulate", str(dive), "--camera", "webcam", "-o", str(out))
+    assert f"scenario {dive}: sensor: --camera webcam has its own" in said
+    assert not out.exists()
+
+
 def test_a_scenario_may_state_the_shutter(tmp_path, refused):
     small = rig_file(tmp_path)
     dive = tmp_path / "dive.yaml"

@@ -26,6 +26,7 @@ from aqualvs.simulation.dive import (
     write_vehicle_log,
 )
 from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scenario
+from aqualvs.simulation.scene import CameraSensor
 from aqualvs.terminal import Echo, StopSignals, Tick, progress
 from aqualvs.text import count_text
 
@@ -67,6 +68,11 @@ def simulate(
             )
         return _simulate_calibration(rig_file, out, echo, camera=model, overwrite=overwrite)
     course = load_scenario(scenario)
+    if eye.development is not None and course.sensor != CameraSensor():
+        raise OptionError(
+            f"scenario {scenario}: sensor: --camera {camera} has its own; leave it out, or choose "
+            "--camera ideal"
+        )
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     if shutter is not None:
         rig = replace(rig, shutter=shutter_from_words(shutter, course.fps))
