@@ -254,7 +254,7 @@ def test_a_laser_on_one_plane_only() -> None:
 
 
 def test_more_lasers_than_expected() -> None:
-    with pytest.raises(CalibrationError, match="more than 2 lasers are seen"):
+    with pytest.raises(CalibrationError, match="more lasers are seen than 2"):
         calibrate_lasers(RIG, box_seen(), box(), options=LaserOptions(n_lasers=2))
 
 

@@ -349,7 +349,7 @@ def check_count(
         raise CalibrationError(_too_few(split, expected, rig, views, surfaces))
     if expected is not None and found > expected:
         raise CalibrationError(
-            f"more than {expected} lasers are seen: {found} planes of light explain the stripes; "
+            f"more lasers are seen than {expected}: {found} planes of light explain the stripes; "
             "correct the number of lasers, or cover what reflects them"
         )
     if expected is None and split.undecided:
@@ -399,7 +399,7 @@ def _planes(
 def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: TargetSurfaces) -> str:
     """Return the number of a plane's points and the pictures it is seen in."""
     patches = plane.patches
-    rest = f" and {len(patches) - 1} others" if len(patches) > 1 else ""
+    rest = f" and {len(patches) - 1} more" if len(patches) > 1 else ""
     return f"{len(plane.members)} points in {_where(patches[0], views, surfaces)}{rest}"
 
 

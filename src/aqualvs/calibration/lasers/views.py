@@ -149,7 +149,7 @@ def place_views(
         except CalibrationError as fault:
             left_out[name] = str(fault).removeprefix(f"{name}: ")
     if not found:
-        few = f" (and {len(left_out) - 1} others likewise)" if len(left_out) > 1 else ""
+        few = f" (and {len(left_out) - 1} more likewise)" if len(left_out) > 1 else ""
         reason = next(
             (f"{name}: {why}" for name, why in left_out.items()), "no pictures were given"
         )
