@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cached_property, partial, partialmethod
+from itertools import chain
 
 import pytest
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -9,6 +10,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from aqualvs.experiments import ablation_stages, growth_and_sun, page, sea, water_index
 from aqualvs.experiments.experiment import MODULES, experiment
 from aqualvs.experiments.laboratory import Laboratory
+from aqualvs.experiments.mesh_filter import Judged
 from aqualvs.experiments.page import save_outcome
 from aqualvs.follow import sensor_model
 from aqualvs.follow.case import Trials
@@ -99,3 +101,15 @@ def test_an_experiment_gives_its_results(
     for one in record.pictures:
         # Something is drawn: more than axes without a curve.
         assert (tmp_path / "figures" / f"{one.file}.png").stat().st_size > 5_000
+
+
+def test_the_filters_sentence_states_the_worst_net_and_range(monkeypatch):
+    good, poor = [Judged(1.0, 1.0)], [Judged(1.0, 0.5)]
+    frames = 2 * poor + 2 * (len(ablation_stages._RANGES) - 1) * good
+    seen = ablation_stages._Seen
+    papers = dict.fromkeys(chain(*ablation_stages._KINDS.values()), frames)
+    monkeypatch.setattr(ablation_stages, "_see", lambda _, net: seen(net, frames, papers))
+    monkeypatch.setattr(ablation_stages, "net_dive", lambda _: None)
+    monkeypatch.setattr(ablation_stages, "_postures", lambda *_: [])
+    monkeypatch.setattr(ablation_stages, "variants_picture", lambda *_: None)
+    assert "keeps at least 50 %" in ablation_stages._run_filters(None).sentence

@@ -112,7 +112,7 @@ def test_two_stripes_on_a_near_ceiling_are_not_read_as_each_others(
     scene = Scene(dome_from_scene=dome_from_target(0.5, 0.0, 0.0), walls=walls, target="wall")
     picture = quick(SMALL).render(scene, 0.0, np.random.default_rng(1))
     luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    posture = equipment(SMALL)[1].process(Frame(0, 0.0, luma, chroma)).posture
+    posture = scanner_of(SMALL).process(Frame(0, 0.0, luma, chroma)).posture
     if is_clear:
         assert posture
         assert posture.range == pytest.approx(0.5, rel=1e-3)

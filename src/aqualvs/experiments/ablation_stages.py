@@ -229,7 +229,7 @@ def nets_at_ranges(net: str) -> Scenario:
 def _run_filters(laboratory: Laboratory) -> ExperimentResult:
     seen = [_see(laboratory, net) for net in _FILTERS_NETS]
     rows = [_row(one, k, where) for one in seen for k, where in enumerate(_RANGES)]
-    ours = [mean_score(one.adaptive).recall for one in seen]
+    ours = [row.adaptive.recall for row in rows]
     named, best, centres = (max(row.paper[kind][1].recall for row in rows) for kind in _KINDS)
     return ExperimentResult(
         sentence=f"The adaptive filter keeps at least {100 * min(ours):.0f} % of a net's "

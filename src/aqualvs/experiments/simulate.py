@@ -68,7 +68,7 @@ def simulate(
             )
         return _simulate_calibration(rig_file, out, echo, camera=model, overwrite=overwrite)
     course = load_scenario(scenario)
-    if eye.development is not None and course.sensor != CameraSensor():
+    if model.development is not None and course.sensor != CameraSensor():
         raise OptionError(
             f"scenario {scenario}: sensor: --camera {camera} has its own; leave it out, or choose "
             "--camera ideal"
