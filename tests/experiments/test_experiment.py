@@ -10,7 +10,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from aqualvs.experiments import ablation_stages, growth_and_sun, page, sea, water_index
 from aqualvs.experiments.experiment import MODULES, experiment
 from aqualvs.experiments.laboratory import Laboratory
-from aqualvs.experiments.mesh_filter import Judged
+from aqualvs.experiments.mesh_filter import PrecisionRecall
 from aqualvs.experiments.page import save_outcome
 from aqualvs.follow import sensor_model
 from aqualvs.follow.case import Trials
@@ -104,7 +104,7 @@ def test_an_experiment_gives_its_results(
 
 
 def test_the_filters_sentence_states_the_worst_net_and_range(monkeypatch):
-    good, poor = [Judged(1.0, 1.0)], [Judged(1.0, 0.5)]
+    good, poor = [PrecisionRecall(1.0, 1.0)], [PrecisionRecall(1.0, 0.5)]
     frames = 2 * poor + 2 * (len(ablation_stages._RANGES) - 1) * good
     seen = ablation_stages._Seen
     papers = dict.fromkeys(chain(*ablation_stages._KINDS.values()), frames)
