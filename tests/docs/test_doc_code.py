@@ -25,6 +25,7 @@ from aqualvs.live.options import load_vehicle
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.pipeline import run_and_print
 from aqualvs.results.run_request import FrameWindow, RunRequest
+from aqualvs.simulation import scenario
 from doc_blocks import Block, blocks
 from repository import ROOT
 from whole import WHOLE
@@ -133,6 +134,8 @@ def test_yaml_is_what_it_is_shown_for(block: Block, tmp_path):
         load_board(path)
     elif "markers" in shown:
         load_box(path)
+    elif "motion" in shown:
+        scenario.read_scenario(path)
     else:
         text = next(b.text for b in YAML if b.page == "rig.md")
         whole = {} if "aqualvs_rig" in shown else yaml.safe_load(text)
@@ -143,3 +146,13 @@ def test_yaml_is_what_it_is_shown_for(block: Block, tmp_path):
             whole[key] = whole.get(key, {}) | value if isinstance(value, dict) else value
         path.write_text(yaml.safe_dump(whole), encoding="utf-8")
         load_rig(path)
+
+
+def test_the_page_names_every_key_of_a_scenario():
+    page = (ROOT / "docs/cameras.md").read_text(encoding="utf-8")
+    section = page.partition("## Scenario files")[2].partition("\n## ")[0]
+    schemas = [one for name, one in vars(scenario).items() if name.endswith("File")]
+    assert len(schemas) == 9
+    for schema in schemas:
+        for key in schema.model_fields:
+            assert f"`{key}`" in section, f"{schema.__name__}.{key}"
