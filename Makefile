@@ -17,7 +17,7 @@ setup: $(STAMP) ## Make .venv with the package and the tools of developers
 demo: $(STAMP) ## Measure the bundled dive; writes out/demo/report.html
 	$(BIN)/aqualvs demo -o out/demo --overwrite
 
-# Three files at a time: on two cores, one that works while others wait. In the order of
+# Four files at a time: on two cores, two that work while others wait. In the order of
 # tests/conftest.py, not by their number of tests: files of few and long tests would be left to the
 # end.
 PARTS := $(filter-out helpers data,$(patsubst tests/%/,%,$(wildcard tests/*/))) \
@@ -28,9 +28,9 @@ FILES = $(wildcard tests/$(PART)/test_*.py tests/$(PART)/*/test_*.py tests/test_
 test: export PYTHONDONTWRITEBYTECODE :=
 # What takes long is done in part, unless WHOLE=1 is given: tests/helpers/whole.py.
 test: export AQUALVS_WHOLE := $(or $(WHOLE),$(AQUALVS_WHOLE))
-test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or one part (PART=scanning), in full by WHOLE=1
+test: $(STAMP) ## Run all tests, four files at a time (JOBS=4), or one part (PART=scanning), in full by WHOLE=1
 	$(if $(PART),$(if $(FILES),,$(error no tests of `$(PART)`; parts are: $(sort $(PARTS)))))
-	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile --no-loadscope-reorder \
+	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),4) --dist=loadfile --no-loadscope-reorder \
 	  --durations=30 --durations-min=5 \
 	  $(if $(PART),$(FILES))
 
@@ -39,7 +39,7 @@ test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or one part (PA
 COUNTED := work_counts speed_ratios start
 coverage: $(STAMP) ## Measure which lines the tests run, by package; fails below 80 %
 	rm -rf out/coverage && mkdir -p out/coverage
-	-$(BIN)/python -m coverage run -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile \
+	-$(BIN)/python -m coverage run -m pytest --numprocesses=$(or $(JOBS),4) --dist=loadfile \
 	  --no-loadscope-reorder --quiet \
 	  $(foreach name,$(COUNTED),--ignore=tests/test_$(name).py)
 	$(BIN)/python -m coverage combine --quiet
