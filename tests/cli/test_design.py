@@ -15,10 +15,10 @@ from aqualvs.design.judge import predict
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from browser import open_page
+from net_dives import frame_of
 from shell_cases import rig_file
 
 SMALL = ["--image", "720x576", "--fov-deg", "48", "--dome-mm", "44.25:5.75"]
@@ -94,8 +94,7 @@ def test_the_rig_it_writes_is_sane_and_measures_as_predicted(folder, capsys):
         picture = Renderer(rig, threads=1).render(
             replace(scene, dome_from_scene=ahead), 0.5, np.random.default_rng(1)
         )
-        luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-        posture = Scanner(rig).process(Frame(0, 0.5, luma, chroma)).posture
+        posture = Scanner(rig).process(frame_of(0, 0.5, picture.image)).posture
         assert posture, posture
         told = predict(design_of_rig(rig), [wall_range]).wall[0]
         found = np.array([posture.range - wall_range, posture.pitch, posture.yaw])

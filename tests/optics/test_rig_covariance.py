@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 
-import cv2
 import numpy as np
 import pytest
 
@@ -24,11 +23,11 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.patch import Patch, fitted_patch, nearest_tangent
 from aqualvs.scanning.posture import Posture, Refusal, range_pitch_yaw
-from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import visible_fit
+from net_dives import frame_of
 from quick_pictures import QuickRenderer
 from whole import WHOLE
 
@@ -63,8 +62,7 @@ def seen(
         fit = visible_fit(picture.lit, SurfaceKind.NET)
         assert fit is not None
         plane = fit[0]
-    image = cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR)
-    peaks = Scanner(rig).detect(Frame(0, time_s, *planes_of_image(image)))
+    peaks = Scanner(rig).detect(frame_of(0, time_s, picture.image))
     return peaks, np.array(range_pitch_yaw(plane.normal / plane.offset))
 
 

@@ -3,16 +3,16 @@
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from aqualvs.optics.rig import Rig, rig_moved_by
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement
-from aqualvs.scanning.scan import Frame, planes_of_image
+from aqualvs.scanning.scan import Frame
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.sources import open_source
+from net_dives import frame_of
 from quick_pictures import QuickRenderer
 from rig_from_sample_truth import load_truth
 
@@ -27,9 +27,8 @@ def frames(scenario_name: str) -> tuple[Frame, ...]:
     for i, t in enumerate(_TIMES.tolist()):
         rng = np.random.default_rng([5, round(1000 * t)])
         picture = renderer.render(scenario.scene_at(t), t, rng)
-        luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
         # Of the frames of a video, every third is looked at.
-        found.append(Frame(3 * i, t, luma, chroma))
+        found.append(frame_of(3 * i, t, picture.image))
     return tuple(found)
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -12,12 +11,13 @@ from scipy.spatial import cKDTree
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
+from aqualvs.scanning.scan import Label, Scan
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Fold, Net, Scene, Wall
 from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import LitPoints, visible_fit
+from net_dives import frame_of
 from quick_pictures import QuickRenderer
 from whole import WHOLE
 
@@ -88,8 +88,7 @@ def shoot(
     scene = Scene(dome_from_scene=pose, nets=nets, walls=walls)
     renderer, scanner = equipment()
     picture = renderer.render(scene, 0.0, np.random.default_rng(7))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    scan = scanner.process(Frame(0, 0.0, luma, chroma))
+    scan = scanner.process(frame_of(0, 0.0, picture.image))
     return Shot(scan, picture.lit, pose.inverse().apply(picture.lit.points_in_dome))
 
 
@@ -248,8 +247,7 @@ def test_a_near_net_of_thick_twine_is_no_wall() -> None:
         0.0,
         np.random.default_rng(5),
     )
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    posture = scanner.process(Frame(0, 0.0, luma, chroma)).posture
+    posture = scanner.process(frame_of(0, 0.0, picture.image)).posture
     assert posture
     assert abs(posture.range / 0.34 - 1.0) < 0.02
 
@@ -265,8 +263,7 @@ def test_a_laser_along_a_strand_makes_no_wall_of_a_net(slide: tuple[float, float
     scene = Scene(dome_from_scene=pose, nets=(Net(mesh="square"),))
     renderer, scanner = equipment()
     picture = renderer.render(scene, 0.0, np.random.default_rng(7))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    scan = scanner.process(Frame(0, 0.0, luma, chroma))
+    scan = scanner.process(frame_of(0, 0.0, picture.image))
     posture = scan.posture
     assert posture
     off = np.array([posture.pitch - pitch, posture.yaw - yaw])

@@ -5,7 +5,6 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 from benchmarks.random_scenes import Difficulty, random_scene
@@ -18,7 +17,7 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.paper.detector import PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
-from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
+from aqualvs.scanning.scan import Frame, Label, Scan
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.simulation.render import RenderedFrame, Renderer
@@ -28,6 +27,7 @@ from aqualvs.simulation.scene import Net, Scene, Wall
 from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import visible_fit
 from aqualvs.sources import open_source
+from net_dives import frame_of
 from quick_pictures import QuickRenderer
 from rig_from_sample_truth import load_truth
 from whole import WHOLE
@@ -142,8 +142,7 @@ def shoot(scene: Scene, seed: int, *, whole: bool = False) -> tuple[Frame, Rende
     """Take a picture, of which all or the light alone is rendered ray by ray."""
     renderer = renderers()[0 if whole else 1]
     picture = renderer.render(scene, 0.0, np.random.default_rng([7, seed]))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    return Frame(0, 0.0, luma, chroma), picture
+    return frame_of(0, 0.0, picture.image), picture
 
 
 def test_random_nets_are_measured_and_never_mistaken() -> None:

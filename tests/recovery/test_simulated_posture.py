@@ -1,9 +1,9 @@
 """Simulate, scan, compare with the truth of the pictures."""
 
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 
@@ -11,12 +11,12 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig, load_scenario
 from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall, WaterOptics
 from aqualvs.simulation.truth import target_fit, visible_fit
+from net_dives import frame_of
 from quick_pictures import QuickRenderer
 
 SMALL, WIDE, FLAT = "example", "bluerov2", "flat port"
@@ -62,8 +62,7 @@ def shoot(scenario_name: str, t: float, rig_name: str = SMALL) -> Shot:
     light_alone = rig_name != SMALL or scene.target == "wall"
     eye = quick(rig_name) if light_alone else whole()
     picture = eye.render(scene, t, np.random.default_rng([7, round(1000 * t)]))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    posture = scanner_of(rig_name).process(Frame(0, t, luma, chroma)).posture
+    posture = scanner_of(rig_name).process(frame_of(0, t, picture.image)).posture
     if scene.target == "none":
         return Shot(posture, None, np.inf)
     truth = scene.target_plane()
@@ -111,8 +110,7 @@ def test_two_stripes_on_a_near_ceiling_are_not_read_as_each_others(
     walls = (Wall(), Wall(pitch=np.deg2rad(pitch_deg)))
     scene = Scene(dome_from_scene=dome_from_target(0.5, 0.0, 0.0), walls=walls, target="wall")
     picture = quick(SMALL).render(scene, 0.0, np.random.default_rng(1))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    posture = scanner_of(SMALL).process(Frame(0, 0.0, luma, chroma)).posture
+    posture = scanner_of(SMALL).process(frame_of(0, 0.0, picture.image)).posture
     if is_clear:
         assert posture
         assert posture.range == pytest.approx(0.5, rel=1e-3)
@@ -127,8 +125,7 @@ def test_the_glow_of_the_sheets_in_turbid_water_moves_no_wall() -> None:
     pose = dome_from_target(0.7, 0.0, np.deg2rad(-5.0))
     scene = Scene(dome_from_scene=pose, walls=(Wall(),), target="wall", water=water)
     picture = whole().render(scene, 0.0, np.random.default_rng(1))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    posture = scanner_of(SMALL).process(Frame(0, 0.0, luma, chroma)).posture
+    posture = scanner_of(SMALL).process(frame_of(0, 0.0, picture.image)).posture
     assert posture
     error = posture.range - 0.7
     # Measured: 0.019 %, and 0.037 % and 1.8 sigma where the pull of the glow stays in.
@@ -162,8 +159,7 @@ def test_a_bulging_net_is_touched_where_it_is_nearest() -> None:
         pose = dome_from_target(rng.uniform(0.35, 0.7), *np.deg2rad(rng.uniform(-8.0, 8.0, 2)))
         scene = Scene(dome_from_scene=pose, nets=(net,), target="net")
         picture = whole().render(scene, 0.0, np.random.default_rng(i))
-        luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-        posture = scanner_of(SMALL).process(Frame(0, 0.0, luma, chroma)).posture
+        posture = scanner_of(SMALL).process(frame_of(0, 0.0, picture.image)).posture
         truth = target_fit(scene, picture.lit)
         assert posture
         assert truth is not None
@@ -191,11 +187,12 @@ def test_a_net_whose_stripes_lost_their_colour() -> None:
     # As H.264 at low bit rates, which drops the chroma of dashes a few pixels long.
     scene = load_scenario("net_diamond").scene_at(2.0)
     picture = whole().render(scene, 2.0, np.random.default_rng(7))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
-    assert chroma is not None
-    flat = (np.full_like(chroma[0], 128), np.full_like(chroma[1], 128))
-    scanner = scanner_of(SMALL)
-    posture, grey = (scanner.process(Frame(0, 2.0, luma, seen)).posture for seen in (flat, None))
+    frame, scanner = frame_of(0, 2.0, picture.image), scanner_of(SMALL)
+    assert frame.chroma is not None
+    neutral = tuple(np.full_like(plane, 128) for plane in frame.chroma)
+    posture, grey = (
+        scanner.process(replace(frame, chroma=chroma)).posture for chroma in (neutral, None)
+    )
     truth = visible_fit(picture.lit, SurfaceKind.NET)
     assert truth is not None
     share, pitch, yaw = errors(Shot(posture, truth[0], np.inf))

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -14,11 +13,12 @@ from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Frame, Scan, planes_of_image
+from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import visible_fit
+from net_dives import frame_of
 from quick_pictures import QuickRenderer
 from windowed_cases import windowed
 
@@ -40,9 +40,8 @@ def shoot(name: str, t: float) -> tuple[Frame, Scene, Plane | None]:
     """A rendered frame, its scene, and the plane of the light on its net."""
     scene = load_scenario(name).scene_at(t)
     picture = renderer().render(scene, t, np.random.default_rng([7, round(1000 * t)]))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
     seen = visible_fit(picture.lit, Kind.NET)
-    return Frame(0, t, luma, chroma), scene, None if seen is None else seen[0]
+    return frame_of(0, t, picture.image), scene, None if seen is None else seen[0]
 
 
 def errors(posture: Posture, truth: Plane) -> tuple[float, float]:
