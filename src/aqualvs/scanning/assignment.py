@@ -310,8 +310,7 @@ class AssignmentTest:
         n_lines = np.bincount(subsegments.laser[on_target], subsegments.n_lines[on_target])
         if np.sort(n_lines)[:-2].sum() >= _ODDS.two_alone * n_lines.sum():
             return False
-        _, faint, _ = self._visibility(target, subsegments)
-        return faint > _ODDS.may_be_faint
+        return self._is_faint(target, subsegments)
 
     def _light_share(
         self,
@@ -334,6 +333,11 @@ class AssignmentTest:
             surface.inlier_weight,
         )
         return share
+
+    def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
+        """Return whether too many of the lasers that should show a surface are faint on it."""
+        _, faint, _ = self._visibility(surface, subsegments)
+        return faint > _ODDS.may_be_faint
 
     def _visibility(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float, float]:
         """Return visible share of a surface's best stripe; shares of faint and of dark lasers."""
@@ -367,8 +371,7 @@ class AssignmentTest:
                 one is not target and one.is_mesh and one.sampling_weight >= target.sampling_weight
             )
             if rivals and _is_nearer(one, target, subsegments):
-                _, faint, _ = self._visibility(target, subsegments)
-                return one if faint > _ODDS.may_be_faint else None
+                return one if self._is_faint(target, subsegments) else None
         return None
 
     def test(
