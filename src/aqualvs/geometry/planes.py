@@ -54,7 +54,9 @@ class Plane:
 
     def packed(self) -> FloatArray:
         """Return normal and offset as one array (4,), for kernels."""
-        return np.append(self.normal, self.offset)
+        packed = np.empty(4)
+        packed[:3], packed[3] = self.normal, self.offset
+        return packed
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
         """Return normal·X - offset for points of shape (..., 3)."""

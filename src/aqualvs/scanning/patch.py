@@ -155,7 +155,7 @@ class Patch:
     def packed(self) -> FloatArray:
         """Return normal, offset, right, up and coefficients as one array (16,), for kernels."""
         packed = np.empty(PACKED)
-        packed[:3], packed[3] = self.base.normal, self.base.offset
+        packed[:RIGHT] = self.base.packed()
         packed[RIGHT:UP], packed[UP:COEFFICIENTS] = self.right, self.up
         packed[COEFFICIENTS:] = self.coefficients
         return packed
