@@ -1,18 +1,18 @@
 """The command `aqualvs demo`: the bundled dive, measured and compared with its truth."""
 
 import importlib.resources
-from collections.abc import Callable
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from aqualvs.errors import SourceError
 from aqualvs.pipeline import run_and_print
 from aqualvs.results.run_request import RunRequest
+from aqualvs.terminal import Echo
 
 _FILES = ("dive.mp4", "rig.yaml", "truth.csv")
 
 
-def demo(out: Path, echo: Callable[[str], object], *, overwrite: bool = False) -> int:
+def demo(out: Path, echo: Echo, *, overwrite: bool = False) -> int:
     """Run the bundled dive, print posture and error, and return the exit code.
 
     Raises `AqualvsError` if the installation lacks the dive, or `out` cannot be written.

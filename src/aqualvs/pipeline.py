@@ -21,7 +21,7 @@ from aqualvs.sources import FrameSource, VideoSource, open_source
 from aqualvs.sources.fields import FieldEvidence, first_pairs, source_of_frames, source_of_pictures
 from aqualvs.sources.opening import existing_path, is_address
 from aqualvs.sources.video import sampled_pictures
-from aqualvs.terminal import StopSignals, progress
+from aqualvs.terminal import Echo, StopSignals, progress
 from aqualvs.text import count_text
 from aqualvs.workers.frame_results import FrameScanner
 from aqualvs.workers.pool import PoolJob, pool_job
@@ -121,7 +121,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
     return result
 
 
-def run_and_print(request: RunRequest, echo: Callable[[str], object]) -> int:
+def run_and_print(request: RunRequest, echo: Echo) -> int:
     """Run a dive, print its results line by line, and return the exit code.
 
     Raises `AqualvsError` as `run`, and the result's `fault`.

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from aqualvs.optics.rigfile import load_rig
 from aqualvs.results.files import AppendFile, Claim, is_locked, read_json, replace_text, writing
 from aqualvs.results.run_request import RunRequest, Water
 from aqualvs.scanner import ScannerOptions
-from aqualvs.terminal import StopSignals
+from aqualvs.terminal import Echo, StopSignals
 from aqualvs.text import count_text
 
 DIVES, DATASET, HOME = "dives", "dataset", ".batch"
@@ -54,7 +54,7 @@ class BatchRequest:
     net: NetRequest | None = None
 
 
-def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
+def batch(request: BatchRequest, echo: Echo) -> int:
     """Measure dives, report progress line by line, and write results, summary and data set.
 
     What an earlier batch in the same folder has finished, of the same dives with the same rig,
@@ -215,7 +215,7 @@ def _summary_lines(
 class BatchProgress(Closing):
     """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager."""
 
-    def __init__(self, n_dives: int, echo: Callable[[str], object]) -> None:
+    def __init__(self, n_dives: int, echo: Echo) -> None:
         self._n_dives, self._n_ended, self._n_frames = n_dives, 0, 0
         self._total = 0
         self._echo = echo

@@ -29,7 +29,7 @@ from aqualvs.scanning.posture import Posture, deviations
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import Feed, PartHealth, State
 from aqualvs.sources.fields import FrameFeed
-from aqualvs.terminal import StopSignals
+from aqualvs.terminal import Echo, StopSignals
 from aqualvs.workers.run_frames import WaterFollowingScanner
 
 _TIMEOUT_S = 3.0
@@ -175,7 +175,7 @@ class LiveRequest:
     index_target: Path | None = None  # Markers on the vehicle that show the water's index.
 
 
-def run_live(request: LiveRequest, echo: Callable[[str], object]) -> int:
+def run_live(request: LiveRequest, echo: Echo) -> int:
     """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
@@ -201,7 +201,7 @@ def make_runner(
     rig: Rig,
     provider: Callable[[], ScannerProvider],
     holder: SetpointHolder,
-    echo: Callable[[str], object],
+    echo: Echo,
     *,
     first: Iterable[Output] = (),
     vehicle: Callable[[], VehicleState | None] | None = None,

@@ -25,6 +25,7 @@ from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.rig import Rig
 from aqualvs.recording import RecorderSwitch
 from aqualvs.schema import Positive, StrictPart, load_settings
+from aqualvs.terminal import Echo
 
 if TYPE_CHECKING:
     from aqualvs.live.dashboard.access import Access
@@ -234,7 +235,7 @@ class Page:
         rig: Rig,
         holder: SetpointHolder,
         recorder: RecorderSwitch | None,
-        echo: Callable[[str], object],
+        echo: Echo,
         vehicle: Callable[[], VehicleState | None],
     ) -> Output:
         """Serve the page and print its address.

@@ -1,6 +1,5 @@
 """`aqualvs net`: condition of a net, from a dive or a run; `aqualvs net-change`: between dates."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,7 +34,7 @@ from aqualvs.results.folder import (
 from aqualvs.results.net_survey import NetPass, check_stored, read_run
 from aqualvs.results.run_request import RunRequest, Status, read_run_yaml, scanner_options
 from aqualvs.sources.opening import folder_beside
-from aqualvs.terminal import StopSignals, progress
+from aqualvs.terminal import Echo, StopSignals, progress
 from aqualvs.text import count_text
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ class NetSource:
     overwrite: bool = False
 
 
-def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
+def net(place: NetSource, request: NetRequest, echo: Echo) -> int:
     """Evaluate the condition of a net, write it and print it.
 
     Returns 0, or 128 + signal if it was stopped: then the files tell of what came before. Raises
@@ -78,7 +77,7 @@ def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) ->
     return run_and_print(run, echo)
 
 
-def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
+def net_of_run(place: NetSource, request: NetRequest, echo: Echo) -> int:
     """Find the state of a net from a run that is on disk; one that was killed is completed first.
 
     Returns and raises as `net`.
@@ -186,7 +185,7 @@ class NetChangeRequest:
             raise OptionError(f"--cell-m {self.cell_m:g}: must be positive; correct it")
 
 
-def net_change(request: NetChangeRequest, echo: Callable[[str], object]) -> "Comparison":
+def net_change(request: NetChangeRequest, echo: Echo) -> "Comparison":
     """Compare dives along the same net, write the changes and print them.
 
     Raises `AqualvsError` if a run cannot be read or a file not be written, or there is nothing to

@@ -5,7 +5,7 @@ Loizou, Robotics 2021, 10, 126): what a laser lit in one frame (13), what each m
 it (14), and the laser-plane image (Eq. 41-42) with the structuring elements (9) to scale.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,6 +38,7 @@ from aqualvs.scanning.paper.mesh_filter import (
     structuring_elements,
 )
 from aqualvs.scanning.scan import Label
+from aqualvs.terminal import Echo
 
 _ZONE = "#e8f3ea"
 
@@ -316,7 +317,7 @@ class _Counts(NamedTuple):
 def figures(
     folder: Path,
     out: Path,
-    echo: Callable[[str], object],
+    echo: Echo,
     *,
     frame: int | None = None,
     laser: str | None = None,
