@@ -146,30 +146,41 @@ def test_a_net_that_is_all_folds_is_measured_by_all_of_its_light(
     assert max(scores) < 3.0
 
 
+def shoot_random_folds(seed: int) -> Shot:
+    rng = np.random.default_rng([1, seed])
+    bar, height, width = rng.uniform((0.018, 0.01, 0.03), (0.035, 0.05, 0.1))
+    period = width * rng.uniform(2.0, 3.5)
+    fold = Fold(
+        direction=rng.uniform(0.0, 1.57), place=0.0, height=-height, width=width, period=period
+    )
+    net = replace(NET, bar=bar, twine=bar * rng.uniform(0.05, 0.12), folds=(fold,))
+    return shoot(net, walls=(), posture=rng.uniform((0.32, -12.0, -12.0), (0.8, 12.0, 12.0)))
+
+
 def test_errors_on_random_folds_are_as_large_as_stated() -> None:
     """On one flank of a fold a plane fits to a tenth of a millimetre, and the net is elsewhere."""
     n = 90 if WHOLE else 10
     scores = []
-    for i in range(115, 115 + n):
-        rng = np.random.default_rng([1, i])
-        bar, height, width = rng.uniform((0.018, 0.01, 0.03), (0.035, 0.05, 0.1))
-        period = width * rng.uniform(2.0, 3.5)
-        fold = Fold(
-            direction=rng.uniform(0.0, 1.57), place=0.0, height=-height, width=width, period=period
-        )
-        net = replace(NET, bar=bar, twine=bar * rng.uniform(0.05, 0.12), folds=(fold,))
-        posture = rng.uniform((0.32, -12.0, -12.0), (0.8, 12.0, 12.0))
-        shot = shoot(net, walls=(), posture=posture)
+    for seed in range(115, 115 + n):
+        shot = shoot_random_folds(seed)
         if isinstance(shot.scan.posture, Posture):
             scores.append(shot.error() / np.sqrt(np.diag(shot.posture.covariance)))
     assert len(scores) >= 0.85 * n
     # By the planes of flanks alone one in six, some by 30 sigmas. In steep folds all lasers may
     # agree on one row of flanks.
     beyond = np.abs(scores).max(axis=1) > 4.0
-    assert np.count_nonzero(beyond) <= max(1, n // 15)
+    assert np.count_nonzero(beyond) <= max(1, n // 22)
     # Of a normal distribution: 0.67.
     assert (np.median(np.abs(scores), axis=0) > 0.25).all()
     assert (np.median(np.abs(scores), axis=0) < 1.0).all()
+
+
+@pytest.mark.parametrize("seed", [199, 241, 398])
+def test_a_flank_with_most_of_the_strands_is_no_sure_posture(seed: int) -> None:
+    shot = shoot_random_folds(seed)
+    if isinstance(shot.scan.posture, Posture):
+        # By the flank's plane alone: 14 to 38.
+        assert np.abs(shot.error() / np.sqrt(np.diag(shot.posture.covariance))).max() < 5.0
 
 
 @pytest.mark.parametrize(
