@@ -302,8 +302,11 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
         for laser, plane in zip(2 * rig.lasers, elsewhere, strict=True)
     ]
 
-    def is_chance(*strands_of: int | None, net: Plane = net) -> bool:
-        """Whether each laser's light on every so many strands is; None: on all its way."""
+    def is_chance(*strands_of: int | None, net: Plane = net, height: float = 1.0) -> bool:
+        """Whether each laser's light on every so many strands is; None: on all its way.
+
+        Its peaks have this share of the height of others.
+        """
 
         def seen_on(one_of: int | None) -> Lit:
             def lit(points: FloatArray) -> BoolArray:
@@ -317,7 +320,11 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
             peaks_of(replace(rig, lasers=(laser,)), [(net, seen_on(one_of))], 0.1)
             for laser, one_of in zip(rig.lasers, strands_of, strict=False)
         ]
-        candidates = find_candidates(joined([*of_net, *loose]), laser_bands, triangulator)
+        low = [
+            {axis: one._replace(height=height * one.height) for axis, one in peaks.items()}
+            for peaks in of_net
+        ]
+        candidates = find_candidates(joined([*low, *loose]), laser_bands, triangulator)
         subsegments, _ = candidates.subsegments()
         seen = surface_on(net, subsegments, len(rig.lasers), 850.0)
         target = replace(seen, is_mesh=True)
@@ -326,6 +333,9 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
     # A third of the light, and an eighth of it on few strands.
     assert not is_chance(1, 1, 1)
     assert is_chance(3, 3, 3)
+    # A twentieth of the light is too little, on however many strands.
+    assert not is_chance(1, 1, 1, height=1 / 16)
+    assert is_chance(1, 1, 1, height=1 / 100)
     # A dark laser: on strands across the stripes, and along one of them.
     assert not is_chance(1, 1)
     assert not is_chance(2, 2)

@@ -76,6 +76,10 @@ class _AssignmentOptions(NamedTuple):
     # share of the lasers may be faint. Tuned on rendered dives: planes through caustics have up to
     # 0.14 of the light, most below 0.1; nets come down to 0.15, folded ones to 0.14.
     small_share: float = 0.12
+    # With less than this share, a surface is there by chance whatever else it shows: 0.05 where
+    # specks of a fouled net made a plane at a third of its range, at least 0.075 on 1,100 nets and
+    # walls in rendered dives.
+    least_share: float = 0.065
     short_visible: float = 0.15
     may_be_faint: float = 0.25
     # Least visible share of the best stripe of a surface with so little light: 0.12 to 0.25 on
@@ -177,6 +181,8 @@ class AssignmentTest:
         # Planes by chance are steep, because there are more steep planes: those that caustics make
         # of this much light are tilted by 39 to 58 degrees, nets of random scenes by 26 at most.
         share *= float(target.plane.normal[1]) ** 2
+        if share < _ODDS.least_share:
+            return True
         if share < _ODDS.small_share and visible < _ODDS.min_visible:
             return True
         # A fish in front of a wall that is out of range: neither is a target.
