@@ -262,6 +262,12 @@ def test_which_of_several_is_the_target() -> None:
     assert choose([wall, net], TargetKind.AUTO, (0.1, 0.2)) is net
 
 
+def test_a_net_with_most_light_may_be_half_hidden_by_a_fish() -> None:
+    net, wall = surface(0.47, 570, True, extent=1218.0), surface(0.95, 540, True, extent=1728.0)
+    assert choose([net, wall], TargetKind.AUTO) is net
+    assert choose([replace(net, sampling_weight=500), wall], TargetKind.AUTO) is wall
+
+
 def test_specks_on_a_plane_are_no_net_before_a_wall_of_light() -> None:
     """Caustics: a few dozen lines share a plane by chance, beside a wall's thousand."""
     wall = surface(0.6, 1200.0, False, extent=1400.0)

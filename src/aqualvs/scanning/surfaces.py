@@ -599,6 +599,8 @@ def _nearest_wide(meshes: Sequence[Surface]) -> Surface | None:
     """Return the nearest mesh with a large extent and weight, else the one with most weight."""
     wide_share = 0.75  # Least extent, as a share of the largest one.
     weight_share = 0.35  # Least sampling weight, as a share of the largest one.
+    # Least extent of the mesh with the largest weight, likewise: a fish may hide half of a net.
+    main_share = 0.5
     widest = max((surface.extent for surface in meshes), default=0.0)
     # A mesh with long lit intervals may be a wall in a net's shadows: its weight does not count.
     broken = [surface for surface in meshes if not surface.is_unbroken] or meshes
@@ -606,7 +608,8 @@ def _nearest_wide(meshes: Sequence[Surface]) -> Surface | None:
     wide = [
         one
         for one in meshes
-        if one.extent >= wide_share * widest and one.sampling_weight >= weight_share * most
+        if one.sampling_weight >= weight_share * most
+        and one.extent >= (main_share if one.sampling_weight >= most else wide_share) * widest
     ]
     best = max(meshes, key=lambda surface: surface.sampling_weight, default=None)
     return min(wide, key=lambda surface: surface.plane.offset, default=best)
