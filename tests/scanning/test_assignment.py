@@ -289,6 +289,11 @@ def slanted_strands(points: FloatArray) -> BoolArray:
     return lit
 
 
+def few_strands(points: FloatArray) -> BoolArray:
+    lit: BoolArray = (points[:, 0] + 0.4 * points[:, 2]) % 0.15 < 0.03
+    return lit
+
+
 def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
     """In daylight without lasers: few pieces of strands, or strands along two of the sheets."""
     rig = example_rig()
@@ -372,6 +377,10 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     assert found is not None
     assert found.is_mesh
     assert found.plane.offset == net.offset
+    # Nor is a coarse one, too few of whose strands are lit to give it an extent.
+    few = overlooked(peaks_of(rig, [(net, few_strands)], 0.1))
+    assert few is not None
+    assert few.extent == 0.0
     # It need not have the pattern of one, if the wall is seen through it.
     dense = overlooked(seen, mesh=False)
     assert dense is not None

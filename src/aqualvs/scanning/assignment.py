@@ -219,8 +219,9 @@ class AssignmentTest:
         if target.is_mesh and not target.is_unbroken:
             return None
         for one in surfaces:
-            # Only gappy stripes have an extent.
-            if one is target or one.extent <= 0.0 or not _is_nearer(one, target, subsegments):
+            # Only gappy stripes have an extent, but not where a coarse net shows few strands.
+            may_be_net = one.is_mesh or one.extent > 0.0
+            if one is target or not may_be_net or not _is_nearer(one, target, subsegments):
                 continue
             share = self._light_share(candidates, subsegments, surfaces, one)
             visible, faint, _ = self._visibility(one, subsegments)
