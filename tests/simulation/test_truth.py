@@ -207,3 +207,16 @@ def test_the_plane_of_a_net_touches_it_where_it_is_nearest(curvature):
         flat = visible_fit(lit, SurfaceKind.NET)
         assert flat is not None
         np.testing.assert_allclose(plane.normal, flat[0].normal, atol=1e-12)
+
+
+def test_the_plane_of_a_wall_is_that_of_its_own_light(renderer):
+    scene = replace(_wall(0.6, 4.0, -6.0), walls=(Wall(), Wall(depth=0.1, yaw=1.2)))
+    lit = renderer.lit_points(scene)
+    on_target = np.abs(scene.target_plane().signed_distance(lit.points_in_dome)) < 1e-9
+    assert 0.2 < on_target.mean() < 0.9
+    found = target_fit(scene, lit)
+    assert found is not None
+    plane, residual = found
+    assert residual < 1e-9
+    assert plane.offset == pytest.approx(0.6, abs=1e-9)
+    np.testing.assert_allclose(plane.normal, scene.target_plane().normal, atol=1e-9)

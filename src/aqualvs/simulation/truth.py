@@ -162,6 +162,8 @@ plane. The `pts` columns count visible lit points by what they lie on.
 # Ratio of the second to the first spread of lit points below which they lie on one line.
 _FLAT = 0.02
 _AIR = 1.1
+# Largest distance of a lit point from the wall that it lies on, in metres.
+_ON_WALL = 1e-6
 # Each step divides what is left by the radius over the range; nets bend less than 1 / m.
 _STEPS_TO_NEAREST = 40
 
@@ -202,7 +204,11 @@ def visible_fit(lit: LitPoints, label: SurfaceKind) -> tuple[Plane, float] | Non
 
     None if there are fewer than three points or all are on one line. The residual is in metres.
     """
-    points: FloatArray = lit.points_in_dome[lit.label == label]
+    return _plane_through(lit.points_in_dome[lit.label == label])
+
+
+def _plane_through(points: FloatArray) -> tuple[Plane, float] | None:
+    """Return the least-squares plane and its largest residual; None if undetermined."""
     if len(points) < 3:
         return None
     centre = points.mean(axis=0)
@@ -217,15 +223,19 @@ def target_fit(scene: Scene, lit: LitPoints) -> tuple[Plane, float] | None:
     """Return the target's plane by its lit points, and their largest residual in metres.
 
     It is what a posture states: of a net that bulges, the plane that touches it at the point
-    nearest to the dome's centre, moved to where the lit points are; else `visible_fit`.
+    nearest to the dome's centre, moved to where the lit points are; else the plane through the lit
+    points, without those on other walls.
     """
-    label = LABELS[scene.target]
-    fit = visible_fit(lit, label)
+    lit_points: FloatArray = lit.points_in_dome[lit.label == LABELS[scene.target]]
+    if scene.target == "wall":
+        off = scene.target_plane().signed_distance(lit_points)
+        lit_points = lit_points[np.abs(off) < _ON_WALL]
+    fit = _plane_through(lit_points)
     net = scene.nets[0] if scene.nets else None
     if fit is None or net is None or not any(net.curvature) or net.folds:
         return fit
     scene_from_dome = scene.dome_from_scene.inverse()
-    points = scene_from_dome.apply(lit.points_in_dome[lit.label == label])
+    points = scene_from_dome.apply(lit_points)
     bend = np.array(net.curvature)
     off = points[:, 1] - 0.5 * points[:, [0, 2]] ** 2 @ bend
     dome = scene_from_dome.translation
