@@ -70,3 +70,13 @@ def test_an_empty_file_is_no_scenario(tmp_path):
     path.write_text("\n")
     with pytest.raises(OptionError, match=r"empty\.yaml: an empty scenario"):
         load_scenario(path)
+
+
+def test_folds_that_run_into_each_other_are_named_before_anything_is_rendered(tmp_path):
+    path = tmp_path / "folds.yaml"
+    path.write_text("net: {folds: [{}, {width_mm: 60, every_mm: 110}]}\n")
+    place = r"folds\.yaml: net\.folds\[1\]\.every_mm is 110; it must be 0 or at least 120, twice"
+    with pytest.raises(OptionError, match=place):
+        load_scenario(path)
+    path.write_text("net: {folds: [{width_mm: 60, every_mm: 120}]}\n")
+    assert load_scenario(path).nets[0].folds[0].period == pytest.approx(0.12)
