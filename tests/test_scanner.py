@@ -169,6 +169,20 @@ def test_a_net_in_open_water(target: Plane) -> None:
     assert_posture(found.posture, target, share=0.006, deg=0.8)
 
 
+def thin_strands(points: FloatArray) -> BoolArray:
+    """Twine of 1.5 mm in squares, slightly turned."""
+    x, z = points[..., 0], points[..., 2]
+    lit: BoolArray = ((x + 0.25 * z) % 0.03 < 0.0015) | ((z - 0.25 * x) % 0.03 < 0.0015)
+    return lit
+
+
+def test_strands_on_two_search_lines_count_in_a_wide_picture() -> None:
+    target = plane(0.9, 5.0, -8.0)
+    found = scan([(target, thin_strands)], rig=bluerov2_rig())
+    assert_posture(found.posture, target)
+    assert found.points.used.mean() > 0.75
+
+
 def test_a_net_before_a_wall_is_the_target_unless_the_wall_is_asked_for() -> None:
     net, wall = plane(0.45, 2.0, -5.0), plane(0.85, 0.0, 4.0)
     both = [(net, strands), (wall, everywhere)]

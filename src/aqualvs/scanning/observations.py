@@ -16,6 +16,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, planes_and_bent, sheet_distance, sheets_of
 from aqualvs.scanning.candidates import Candidates
+from aqualvs.scanning.laser_bands import pixels_per_line
 from aqualvs.scanning.stripe import PULL_OF_STEP, flank_difference
 
 # Position noise of a unit's centroid beyond that of its peaks: a floor that neighbouring peaks
@@ -24,9 +25,9 @@ from aqualvs.scanning.stripe import PULL_OF_STEP, flank_difference
 _SUBSEGMENT_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
 # Least number of search lines of the light on a strand; less is a fragment, off the strand's
-# middle. Rows of a field are two pixels apart, and thin twine across them is rarely seen in more
-# than two.
-_SHORTEST_STRAND, _SHORTEST_IN_FIELD = 3, 2
+# middle. Rows of a field and the search lines of wide pictures are two pixels apart, and thin twine
+# across them is rarely seen in more than two.
+_SHORTEST_STRAND, _SHORTEST_IF_COARSE = 3, 2
 # Share of a strand's maximum height below which a peak does not count. On rendered nets, in clear
 # and turbid water, it reduces the scatter of strands by 10 to 20 %; 0.3 and 0.5 do about the same.
 _DIM_SHARE = 0.4
@@ -80,8 +81,8 @@ class StripeObserver:
         sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
         self.planes, self.bent = planes_and_bent(sheets)
         self._focal_px = rig.focal_px
-        in_fields = rig.shutter.is_interlaced
-        self._shortest_strand = _SHORTEST_IN_FIELD if in_fields else _SHORTEST_STRAND
+        is_coarse = rig.shutter.is_interlaced or pixels_per_line(rig.size_px) > 1
+        self._shortest_strand = _SHORTEST_IF_COARSE if is_coarse else _SHORTEST_STRAND
 
     def observe(
         self,
