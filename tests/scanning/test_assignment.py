@@ -354,6 +354,34 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
     assert is_chance(2, 2, net=steep)
 
 
+@pytest.mark.parametrize(("one_of", "is_chance"), [(1, False), (2, True)])
+def test_two_lasers_show_any_plane_evenly(one_of: int, is_chance: bool) -> None:
+    """A plane of two lasers with little of the light is not saved by lasers that are not dark."""
+    rig = example_rig()
+    rig = replace(rig, lasers=rig.lasers[:2])
+    laser_bands, triangulator = plan_bands(rig, rig.camera()), Triangulator(rig, rig.camera())
+    test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
+
+    def lit(points: FloatArray) -> BoolArray:
+        on: BoolArray = slanted_strands(points) & (
+            (points[:, 0] + 0.4 * points[:, 2]) // 0.03 % one_of == 0
+        )
+        return on
+
+    net = Plane.from_normal((0.1, 1.0, 0.0), 0.5)
+    parts = [peaks_of(rig, [(net, lit)], 0.1)]
+    for x, z, distance in [(0.4, 0.2, 0.7), (-0.3, 0.2, 0.8), (0.1, 0.2, 0.4), (-0.2, -0.3, 0.6)]:
+        for laser in rig.lasers:
+            elsewhere = Plane.from_normal((x + 0.1 * (laser is rig.lasers[0]), 1.0, z), distance)
+            parts.append(
+                peaks_of(replace(rig, lasers=(laser,)), [(elsewhere, slanted_strands)], 0.1)
+            )
+    candidates = find_candidates(joined(parts), laser_bands, triangulator)
+    subsegments, _ = candidates.subsegments()
+    target = replace(surface_on(net, subsegments, len(rig.lasers), 850.0), is_mesh=True)
+    assert test.is_by_chance(candidates, subsegments, [target], target) is is_chance
+
+
 def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = example_rig()
     net, wall = Plane.from_normal((0.1, 1.0, 0.0), 0.4), Plane.from_normal((0.0, 1.0, 0.1), 0.8)

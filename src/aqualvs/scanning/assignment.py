@@ -181,9 +181,9 @@ class AssignmentTest:
         # Planes by chance are steep, because there are more steep planes: those that caustics make
         # of this much light are tilted by 39 to 58 degrees, nets of random scenes by 26 at most.
         share *= float(target.plane.normal[1]) ** 2
-        if share < _ODDS.least_share:
-            return True
-        if share < _ODDS.small_share and visible < _ODDS.min_visible:
+        # Two lasers are on any plane that is found, so they show it evenly.
+        least = _ODDS.small_share if len(self._along_x) == 2 else _ODDS.least_share
+        if share < least or (share < _ODDS.small_share and visible < _ODDS.min_visible):
             return True
         # A fish in front of a wall that is out of range: neither is a target.
         outweighed = not target.is_mesh and any(
