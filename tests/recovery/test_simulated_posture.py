@@ -9,6 +9,7 @@ import pytest
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Laser
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.simulation.render import Renderer
@@ -118,6 +119,19 @@ def test_two_stripes_on_a_near_ceiling_are_not_read_as_each_others(
         assert isinstance(posture, Refusal)
         assert posture.reason is Reason.AMBIGUOUS
         assert "two lasers alone" in posture.detail
+
+
+def test_two_long_stripes_are_found_among_the_specks_of_caustics() -> None:
+    upper = Laser("upper", Plane.from_normal((0.0, 0.0, 1.0), 0.15))
+    lower = Laser("lower", Plane.from_normal((0.0, -0.165, 0.986), -0.148))
+    rig = replace(example_rig(), lasers=(upper, lower))
+    pose = dome_from_target(0.9, np.deg2rad(3.0), np.deg2rad(-4.0))
+    sun = WaterOptics(caustics=0.5, glare=0.3, ambient=(0.4, 0.6, 0.6))
+    scene = Scene(dome_from_scene=pose, walls=(Wall(),), target="wall", water=sun)
+    image = Renderer(rig, threads=2).render(scene, 0.9, np.random.default_rng(3)).image
+    found = Scanner(rig).process(frame_of(0, 0.9, image)).posture
+    assert found, found
+    assert found.range == pytest.approx(0.9, rel=3e-4)
 
 
 def test_the_glow_of_the_sheets_in_turbid_water_moves_no_wall() -> None:

@@ -132,6 +132,9 @@ other surfaces have left over."""
 # photograph with 15 lasers and five candidates a peak, the wall has 0.18; this limit adds no
 # posture to 775 rendered nets without lasers.
 _CLEAR_SHARE = 0.1
+# The same where the sampling weights show no plane at all: 0.1 would give a posture to one of 96
+# rendered frames of caustics with the lasers off, this to none. A wall has 0.9 in such caustics.
+_MAIN_SHARE = 0.3
 LINES, INLIER_WEIGHT, SAMPLING_WEIGHT = range(3)
 """Sums over a surface: search lines on it, intensity weight, and sampling weight."""
 
@@ -180,7 +183,7 @@ def search_surfaces(
     # Least intensity weight, as a share of that of all candidates; planes through noise have up to
     # 0.01.
     min_share = 0.03
-    weight, found = table[WEIGHT], ZERO
+    weight, found, again = table[WEIGHT], ZERO, False
     while found < MAX_SURFACES:
         rows, left = flatnonzero(free), 0
         for k in range(rows.shape[0]):
@@ -188,22 +191,22 @@ def search_surfaces(
         if left < enough or rows.shape[0] < min_subsegments:
             return found
         plane, mine = planes[found], members[found]
-        if not _find_plane(table, weight, laser, rows, n_lasers, nearest, farthest, found, plane):
-            return found
-        by_laser, supporting = np.zeros((3, n_lasers)), 0
-        n = _collect_inliers(subsegments, rows, plane, mine, by_laser)
+        by_laser, supporting, n = np.zeros((3, n_lasers)), 0, 0
+        if _find_plane(table, weight, laser, rows, n_lasers, nearest, farthest, found, plane):
+            n = _collect_inliers(subsegments, rows, plane, mine, by_laser)
         for i in range(n_lasers):
             supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
         sums[found, LINES] = sum_of(by_laser[LINES])
-        if n < min_subsegments or supporting < 2 or sums[found, LINES] < min_lines:
-            return found
-        if sum_of(by_laser[INLIER_WEIGHT]) < min_share * sum_of(intensity_weight):
-            if found > 0 or min_share == _CLEAR_SHARE:
+        is_plane = n >= min_subsegments and supporting >= 2 and sums[found, LINES] >= min_lines
+        light = sum_of(by_laser[INLIER_WEIGHT])
+        if not is_plane or light < min_share * sum_of(intensity_weight):
+            if found > 0 or again:
                 return found
-            # Many specks, as between lines that a camera has sharpened, limit the sampling weights
-            # of long stripes too much: search again by intensity weight, but only for a surface
-            # that stands out.
-            weight, min_share = intensity_weight, _CLEAR_SHARE
+            # The sampling weights of long stripes are limited, too much between many specks: of
+            # caustics, of a camera that sharpens, or of another laser on thin twine. Search again
+            # by intensity weight, but only for a surface that stands out.
+            again, weight = True, intensity_weight
+            min_share = _CLEAR_SHARE if is_plane else _MAIN_SHARE
             mine[:] = False
             continue
         sums[found, INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
