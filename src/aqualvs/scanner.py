@@ -37,6 +37,7 @@ from aqualvs.scanning.surfaces import (
     as_requested_kind,
     choose_target,
     find_surfaces,
+    left_over,
     shares_peaks,
     surface_on,
 )
@@ -304,7 +305,7 @@ class Scanner:
             surfaces, target, _, (verdict, other, _) = choice
             if target is None or verdict is not Verdict.RIVAL or other is None:
                 break
-            surfaces = self._with_rival(surfaces, target, other, stripes.subsegments)
+            surfaces = self._with_rival(surfaces, target, other, stripes)
             choice = self._choose_and_test(stripes, surfaces)
         return choice
 
@@ -364,7 +365,9 @@ class Scanner:
                 "show another if each stripe were the other laser's"
             )
             return Refusal(Reason.AMBIGUOUS, detail)
-        others = assignment.other_lines(candidates, subsegments, stripes.shapes, target)
+        others = assignment.other_lines(
+            candidates, subsegments, stripes.shapes, choice.surfaces, target
+        )
         if others is not None:
             detail = (
                 f"beside the stripes on the surface at {target.plane.offset:.3f} m there is "
@@ -409,11 +412,18 @@ class Scanner:
         return replace(posture, rig_covariance=covariance)
 
     def _with_rival(
-        self, surfaces: list[Surface], target: Surface, other: Plane, subsegments: Subsegments
+        self, surfaces: list[Surface], target: Surface, other: Plane, stripes: _Stripes
     ) -> list[Surface]:
-        """Replace a surface by the rival that explains the picture better."""
-        rival = surface_on(other, subsegments, len(self.rig.lasers), self.rig.focal_px)
-        kept = [
+        """Replace a surface by the rival that explains the picture better.
+
+        A net before the rival remains with the light that is not the rival's.
+        """
+        candidates, subsegments = stripes.candidates, stripes.subsegments
+        of_rig = len(self.rig.lasers), self.rig.focal_px
+        rival = surface_on(other, subsegments, *of_rig)
+        rest = left_over(target, rival, subsegments, candidates.pixels, *of_rig)
+        kept = [] if rest is None or not rest.is_mesh else [rest]
+        kept += [
             one
             for one in surfaces
             if one is not target and not shares_peaks(one, rival, subsegments)

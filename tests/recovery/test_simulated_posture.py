@@ -9,7 +9,10 @@ import pytest
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.optics.rig import Laser
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.lens import Lens
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.simulation.render import Renderer
@@ -218,6 +221,35 @@ def test_a_net_whose_stripes_lost_their_colour() -> None:
     ratio = np.diag(posture.covariance) / np.diag(grey.covariance)
     assert np.all(ratio < 1.4)
     assert np.all(ratio > 0.6)
+
+
+def test_a_net_is_the_target_where_its_stripes_lie_on_other_lasers_of_the_wall() -> None:
+    """Two of three parallel stripes on the net merge with their neighbours' on the wall."""
+    level = [(0.0, lean, 1.0) for lean in (-0.175, -0.25, -0.325)]
+    upright = [(1.0, lean, 0.0) for lean in (-0.35, -0.25, -0.15)]
+    lasers = tuple(
+        Laser(f"{i}", Plane.from_normal(normal, -0.2)) for i, normal in enumerate(level + upright)
+    )
+    rig = example_rig()
+    rig = replace(
+        rig,
+        size_px=(800, 600),
+        lens=Lens(fx=700.0, fy=700.0, cx=399.5, cy=299.5),
+        dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.array([0.0, 0.005, 0.0])),
+        housing=Dome(inner_radius=0.05, thickness=0.005, n_acrylic=1.49),
+        lasers=lasers,
+        working_range=(0.25, 1.3),
+    )
+    scene = Scene(
+        dome_from_scene=dome_from_target(0.69, np.deg2rad(-6.0), np.deg2rad(1.3)),
+        walls=(Wall(depth=0.25),),
+        nets=(Net(bar=0.03),),
+        target="net",
+    )
+    image = Renderer(rig, threads=2).render(scene, 0.69, np.random.default_rng(3)).image
+    found = Scanner(rig).process(frame_of(0, 0.69, image)).posture
+    assert found, found
+    assert found.range == pytest.approx(0.689, rel=2e-3)
 
 
 def test_the_wall_behind_a_net_is_never_the_target() -> None:

@@ -273,6 +273,7 @@ class AssignmentTest:
         candidates: Candidates,
         subsegments: Subsegments,
         shapes: ComponentShapes,
+        surfaces: Sequence[Surface],
         target: Surface,
     ) -> float | None:
         """Return the light in other lines beside a target's stripes, if it is too much.
@@ -281,8 +282,8 @@ class AssignmentTest:
 
         Parameters
         ----------
-        candidates, subsegments, shapes, target
-            As in `may_hide_net`.
+        candidates, subsegments, shapes, surfaces, target
+            As in `may_hide_net`. What shows as many lasers behind a net is no other line.
 
         Returns
         -------
@@ -290,11 +291,19 @@ class AssignmentTest:
             As a share of the target's own light. None if it is no evidence against the target.
         """
         n_lasers = len(self._along_x)
-        n_on_target = np.count_nonzero(np.bincount(subsegments.laser[target.members]))
+        n_on_target = _n_lasers_on(target, subsegments)
         if n_on_target > _ODDS.may_be_chance:
             return None
-        on_target = target.members[subsegments.of_candidate]
-        share: float = other_lines_share(candidates, on_target, shapes, n_lasers)
+        # Two lasers of many make planes by chance behind the target, too.
+        behind, few = np.zeros(subsegments.n, np.bool_), 3
+        for one in surfaces if target.is_mesh else ():
+            shows_all = _n_lasers_on(one, subsegments) >= max(n_on_target, few)
+            if shows_all and _is_nearer(target, one, subsegments):
+                behind |= one.members
+        of_candidate = subsegments.of_candidate
+        share: float = other_lines_share(
+            candidates, target.members[of_candidate], behind[of_candidate], shapes, n_lasers
+        )
         most = _ODDS.max_other_lines_of_net if target.is_mesh else _ODDS.max_other_lines
         return share if share > most else None
 
@@ -423,6 +432,10 @@ def _is_small(surface: Surface, share: float, visible: float) -> bool:
     return share < _ODDS.small_share or (not surface.is_mesh and visible < _ODDS.short_visible)
 
 
+def _n_lasers_on(surface: Surface, subsegments: Subsegments) -> int:
+    return int(np.count_nonzero(np.bincount(subsegments.laser[surface.members])))
+
+
 def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
     """Return whether most of a surface's light lies in front of another surface's plane."""
     sampling_weight, plane = subsegments.table[WEIGHT], target.plane
@@ -434,7 +447,11 @@ def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
 
 @lazy_kernel
 def other_lines_share(
-    candidates: Candidates, on_target: BoolArray, shapes: ComponentShapes, n_lasers: int
+    candidates: Candidates,
+    on_target: BoolArray,
+    behind: BoolArray,
+    shapes: ComponentShapes,
+    n_lasers: int,
 ) -> float:
     """Return the light in other lines on the search lines of a surface, over the surface's light.
 
@@ -445,8 +462,8 @@ def other_lines_share(
     ----------
     candidates : Candidates
         N of them.
-    on_target : bool array, shape (N,)
-        Candidates on the surface.
+    on_target, behind : bool array, shape (N,)
+        Candidates on the surface, and on those behind it whose peaks do not count.
     shapes : ComponentShapes
         Of the candidates' components.
     n_lasers : int
@@ -457,6 +474,8 @@ def other_lines_share(
     lit = np.zeros((n_lasers, n_bins(line)), np.bool_)
     of_surface, others = 0.0, 0.0
     for i in range(source.shape[0]):
+        if behind[i]:
+            own[source[i]] = True
         if on_target[i]:
             own[source[i]] = True
             lit[laser[i], line[i]] = True

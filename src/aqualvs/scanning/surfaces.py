@@ -125,6 +125,7 @@ MAX_SURFACES = 5
 """Largest number of surfaces in a frame."""
 MIN_LINES_PER_LASER = 8
 """Least number of search lines with which a laser supports a surface."""
+_MIN_LINES = 30  # Least number of search lines of a surface.
 WORTH_SHARE = 0.08
 """Least search lines and sampling weight of a surface, as a share of the best one's; less is what
 other surfaces have left over."""
@@ -177,8 +178,7 @@ def search_surfaces(
         free[c] = True
     cell = np.empty(pixels.shape[0], np.int64)
     n_cells, n_columns = 0, 0
-    min_lines = 30
-    enough = float(min_lines)
+    enough = float(_MIN_LINES)
     min_subsegments = 6
     # Least intensity weight, as a share of that of all candidates; planes through noise have up to
     # 0.01.
@@ -197,7 +197,7 @@ def search_surfaces(
         for i in range(n_lasers):
             supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
         sums[found, LINES] = sum_of(by_laser[LINES])
-        is_plane = n >= min_subsegments and supporting >= 2 and sums[found, LINES] >= min_lines
+        is_plane = n >= min_subsegments and supporting >= 2 and sums[found, LINES] >= _MIN_LINES
         light = sum_of(by_laser[INLIER_WEIGHT])
         if not is_plane or light < min_share * sum_of(intensity_weight):
             if found > 0 or again:
@@ -299,6 +299,46 @@ def collect_surface(
     sums[LINES] = sum_of(by_laser[LINES])
     sums[INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
     sums[SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
+
+
+@lazy_kernel
+def collect_left_over(
+    subsegments: Subsegments,
+    pixels: FloatArray,
+    n_lasers: int,
+    others: BoolArray,
+    members: BoolArray,
+    sums: FloatArray,
+) -> bool:
+    """Remove another surface's light from a surface; return whether enough is left of it.
+
+    Parameters
+    ----------
+    subsegments, pixels, n_lasers
+        As in `search_surfaces`.
+    others : bool array, shape (C,)
+        Subsegments on the other surface.
+    members : bool array, shape (C,)
+        Subsegments on the surface; False is written where their light is the other's.
+    sums : array, shape (3,)
+        Written, as in `collect_surface`.
+    """
+    cell = np.empty(pixels.shape[0], np.int64)
+    n_cells, n_columns = number_cells(pixels, cell)
+    _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, others, members)
+    by_laser, supporting = np.zeros((3, n_lasers)), 0
+    for c in range(members.shape[0]):
+        if members[c]:
+            i = subsegments.laser[c]
+            by_laser[LINES, i] += subsegments.n_lines[c]
+            by_laser[INLIER_WEIGHT, i] += subsegments.intensity_weight[c]
+            by_laser[SAMPLING_WEIGHT, i] += subsegments.table[WEIGHT, c]
+    for i in range(n_lasers):
+        supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
+    sums[LINES] = sum_of(by_laser[LINES])
+    sums[INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
+    sums[SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
+    return supporting >= 2 and sums[LINES] >= _MIN_LINES
 
 
 @lazy_borrowing_kernel
@@ -420,6 +460,30 @@ def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: 
     sums = np.empty(3)
     collect_surface(subsegments, n_lasers, packed, members, sums)
     return _describe(subsegments, packed, members, sums, n_lasers, focal_px)
+
+
+def left_over(
+    one: Surface,
+    other: Surface,
+    subsegments: Subsegments,
+    pixels: FloatArray,
+    n_lasers: int,
+    focal_px: float,
+) -> Surface | None:
+    """Return a surface without another one's light; None if that leaves too little of it.
+
+    Parameters
+    ----------
+    one, other : Surface
+        The surface, and the one whose light it loses.
+    subsegments, pixels, n_lasers, focal_px
+        As in `find_surfaces`.
+    """
+    members, sums = one.members.copy(), np.empty(3)
+    if not collect_left_over(subsegments, pixels, n_lasers, other.members, members, sums):
+        return None
+    plane = one.plane.packed()
+    return _describe(subsegments, plane, members, sums, n_lasers, focal_px)
 
 
 def shares_peaks(one: Surface, other: Surface, subsegments: Subsegments) -> bool:
