@@ -283,7 +283,8 @@ class AssignmentTest:
         Parameters
         ----------
         candidates, subsegments, shapes, surfaces, target
-            As in `may_hide_net`. What shows as many lasers behind a net is no other line.
+            As in `may_hide_net`. A solid surface behind a net that shows as many lasers is no other
+            line.
 
         Returns
         -------
@@ -294,11 +295,11 @@ class AssignmentTest:
         n_on_target = _n_lasers_on(target, subsegments)
         if n_on_target > _ODDS.may_be_chance:
             return None
-        # Two lasers of many make planes by chance behind the target, too.
+        # Two lasers of many make planes by chance behind the target, too, and more of them meshes.
         behind, few = np.zeros(subsegments.n, np.bool_), 3
         for one in surfaces if target.is_mesh else ():
             shows_all = _n_lasers_on(one, subsegments) >= max(n_on_target, few)
-            if shows_all and _is_nearer(target, one, subsegments):
+            if shows_all and not one.is_mesh and _is_nearer(target, one, subsegments):
                 behind |= one.members
         of_candidate = subsegments.of_candidate
         share: float = other_lines_share(
