@@ -76,15 +76,15 @@ class _AssignmentOptions(NamedTuple):
     # share of the lasers may be faint. Tuned on rendered dives: planes through caustics have up to
     # 0.14 of the light, most below 0.1; nets come down to 0.15, folded ones to 0.14.
     small_share: float = 0.12
-    # With less than this share, a surface is there by chance whatever else it shows: 0.05 where
-    # specks of a fouled net made a plane at a third of its range, at least 0.075 on 1,100 nets and
-    # walls in rendered dives.
-    least_share: float = 0.065
     short_visible: float = 0.15
     may_be_faint: float = 0.25
     # Least visible share of the best stripe of a surface with so little light: 0.12 to 0.25 on
     # nets, 0.05 to 0.09 where strands in daylight make a plane by chance.
     min_visible: float = 0.1
+    # With less light than this, a surface is there by chance whatever else it shows: specks of a
+    # fouled net that made a plane at a third of its range had 0.05, 1,100 nets and walls in
+    # rendered dives 0.075 and more.
+    least_share: float = 0.065
     # A net on which a laser is dark, with less than this share of the light, may be a single strand
     # along another laser's sheet, which then has more than this visible share. If a laser has
     # moved, the other two have more of the light.

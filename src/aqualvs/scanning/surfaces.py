@@ -191,12 +191,10 @@ def search_surfaces(
         if left < enough or rows.shape[0] < min_subsegments:
             return found
         plane, mine = planes[found], members[found]
-        by_laser, supporting, n = np.zeros((3, n_lasers)), 0, 0
+        by_laser, n = np.zeros((3, n_lasers)), 0
         if _find_plane(table, weight, laser, rows, n_lasers, nearest, farthest, found, plane):
             n = _collect_inliers(subsegments, rows, plane, mine, by_laser)
-        for i in range(n_lasers):
-            supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
-        sums[found, LINES] = sum_of(by_laser[LINES])
+        supporting = _sum_lasers(by_laser, sums[found])
         is_plane = n >= min_subsegments and supporting >= 2 and sums[found, LINES] >= _MIN_LINES
         light = sum_of(by_laser[INLIER_WEIGHT])
         if not is_plane or light < min_share * sum_of(intensity_weight):
@@ -209,8 +207,6 @@ def search_surfaces(
             min_share = _CLEAR_SHARE if is_plane else _MAIN_SHARE
             mine[:] = False
             continue
-        sums[found, INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
-        sums[found, SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
         enough = max(enough, WORTH_SHARE * sums[found, LINES])
         if n_cells == 0:
             n_cells, n_columns = number_cells(pixels, cell)
@@ -259,7 +255,7 @@ def _collect_inliers(
 
     `by_laser`, shape (3, n_lasers), gets their sums for each laser, rows as `LINES` and the others.
     """
-    table, laser, n = subsegments.table, subsegments.laser, 0
+    table, n = subsegments.table, 0
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
     for k in range(rows.shape[0]):
         c = rows[k]
@@ -267,11 +263,30 @@ def _collect_inliers(
         per_px = nx * table[JX, c] + ny * table[JY, c] + nz * table[JZ, c]
         if residual * residual < squared_gate(per_px, offset):
             members[c] = True
-            by_laser[LINES, laser[c]] += subsegments.n_lines[c]
-            by_laser[INLIER_WEIGHT, laser[c]] += subsegments.intensity_weight[c]
-            by_laser[SAMPLING_WEIGHT, laser[c]] += table[WEIGHT, c]
+            _add_subsegment(subsegments, c, by_laser)
             n += 1
     return n
+
+
+@inline_borrowing_kernel
+def _add_subsegment(subsegments: Subsegments, c: int, by_laser: FloatArray) -> None:
+    """Add subsegment c to the sums of its laser."""
+    i = subsegments.laser[c]
+    by_laser[LINES, i] += subsegments.n_lines[c]
+    by_laser[INLIER_WEIGHT, i] += subsegments.intensity_weight[c]
+    by_laser[SAMPLING_WEIGHT, i] += subsegments.table[WEIGHT, c]
+
+
+@inner_borrowing_kernel
+def _sum_lasers(by_laser: FloatArray, sums: FloatArray) -> int:
+    """Write the sums over all lasers (3,); return the number of lasers with enough lines."""
+    sums[LINES] = sum_of(by_laser[LINES])
+    sums[INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
+    sums[SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
+    supporting = 0
+    for i in range(by_laser.shape[1]):
+        supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
+    return supporting
 
 
 @lazy_kernel
@@ -296,9 +311,7 @@ def collect_surface(
     by_laser = np.zeros((3, n_lasers))
     rows = np.arange(subsegments.laser.shape[0])
     _collect_inliers(subsegments, rows, plane, members, by_laser)
-    sums[LINES] = sum_of(by_laser[LINES])
-    sums[INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
-    sums[SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
+    _sum_lasers(by_laser, sums)
 
 
 @lazy_kernel
@@ -326,19 +339,11 @@ def collect_left_over(
     cell = np.empty(pixels.shape[0], np.int64)
     n_cells, n_columns = number_cells(pixels, cell)
     _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, others, members)
-    by_laser, supporting = np.zeros((3, n_lasers)), 0
+    by_laser = np.zeros((3, n_lasers))
     for c in range(members.shape[0]):
         if members[c]:
-            i = subsegments.laser[c]
-            by_laser[LINES, i] += subsegments.n_lines[c]
-            by_laser[INLIER_WEIGHT, i] += subsegments.intensity_weight[c]
-            by_laser[SAMPLING_WEIGHT, i] += subsegments.table[WEIGHT, c]
-    for i in range(n_lasers):
-        supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
-    sums[LINES] = sum_of(by_laser[LINES])
-    sums[INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
-    sums[SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
-    return supporting >= 2 and sums[LINES] >= _MIN_LINES
+            _add_subsegment(subsegments, c, by_laser)
+    return _sum_lasers(by_laser, sums) >= 2 and sums[LINES] >= _MIN_LINES
 
 
 @lazy_borrowing_kernel
