@@ -489,6 +489,9 @@ def test_the_background_is_the_higher_of_the_least_pixels_on_either_side(reach_p
         # The lines of the wall have their colour: the dashes had theirs, and are something else.
         (0.2, 1.0, 400.0, False),
         (0.5, 0.5, 400.0, False),
+        # Hardly a dash has any, and with the lines there are not many more than the lasers make.
+        (0.1, 1.0, 400.0, True),
+        (0.1, 1.0, 180.0, False),
         # Far more peaks than the lasers can make; long lines that are few of what they can make.
         (0.2, 0.5, 140.0, False),
         (0.2, 0.5, 500.0, False),
