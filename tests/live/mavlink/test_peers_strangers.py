@@ -194,6 +194,7 @@ def test_spoofed_modes_that_contradict_the_vehicles_stop_us(dive: Dive) -> None:
 def test_nobody_is_steered_while_two_are_the_vehicle_from_the_start(dive: Dive) -> None:
     with Strangers(PORT, [beat(2), attitude()], count=1) as strangers:
         until(lambda: dive.vehicle.state().rival, "a rival")
+        until(lambda: dive.vehicle.state().mode == "ours", "the ground station")
         with pytest.raises(
             OptionError, match=r"two senders claim to be the vehicle.*both speak as sysid 1"
         ):
