@@ -43,7 +43,7 @@ def pack_fold(i_net: int, fold: Fold) -> FloatArray:
     """
     if not fold.width > 0.0:
         raise OptionError(f"fold of a net: width is {1e3 * fold.width:g} mm; it must be positive")
-    if 0.0 < fold.period < 2.0 * fold.width:
+    if fold.overlaps:
         raise OptionError(
             f"fold of a net: period is {1e3 * fold.period:g} mm, less than the "
             f"{2e3 * fold.width:g} mm from foot to foot; make it longer or 0"

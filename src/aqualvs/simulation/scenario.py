@@ -414,7 +414,7 @@ def parse_scenario(content: Any, name: str, source: str) -> Scenario:
     """
     file = validated(ScenarioFile, content, f"scenario {source}", OptionError)
     for i, fold in enumerate(file.net.folds if file.net else []):
-        if 0.0 < fold.every_mm < 2.0 * fold.width_mm:
+        if _fold(fold).overlaps:
             raise OptionError(
                 f"scenario {source}: net.folds[{i}].every_mm is {fold.every_mm:g}; it must be 0 or "
                 f"at least {2.0 * fold.width_mm:g}, twice width_mm"

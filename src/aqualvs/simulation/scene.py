@@ -69,6 +69,11 @@ class Fold:
     # Distance from crest to crest in metres; 0 is a single fold.
     period: float = 0.0
 
+    @property
+    def overlaps(self) -> bool:
+        """Whether the folds of a row run into each other."""
+        return 0.0 < self.period < 2.0 * self.width
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Net:
