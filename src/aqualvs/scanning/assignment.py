@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import lazy_kernel
 from aqualvs.geometry.linear_algebra import n_bins
 from aqualvs.geometry.planes import Plane
@@ -301,9 +301,8 @@ class AssignmentTest:
             shows_all = _n_lasers_on(one, subsegments) >= max(n_on_target, few)
             if shows_all and not one.is_mesh and _is_nearer(target, one, subsegments):
                 behind |= one.members
-        of_candidate = subsegments.of_candidate
         share: float = other_lines_share(
-            candidates, target.members[of_candidate], behind[of_candidate], shapes, n_lasers
+            candidates, subsegments.of_candidate, target.members, behind, shapes, n_lasers
         )
         most = _ODDS.max_other_lines_of_net if target.is_mesh else _ODDS.max_other_lines
         return share if share > most else None
@@ -449,7 +448,8 @@ def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
 @lazy_kernel
 def other_lines_share(
     candidates: Candidates,
-    on_target: BoolArray,
+    of_candidate: IntArray,
+    members: BoolArray,
     behind: BoolArray,
     shapes: ComponentShapes,
     n_lasers: int,
@@ -463,8 +463,10 @@ def other_lines_share(
     ----------
     candidates : Candidates
         N of them.
-    on_target, behind : bool array, shape (N,)
-        Candidates on the surface, and on those behind it whose peaks do not count.
+    of_candidate : int array, shape (N,)
+        Row of each one's subsegment.
+    members, behind : bool array, shape (C,)
+        Subsegments on the surface, and on those behind it whose peaks do not count.
     shapes : ComponentShapes
         Of the candidates' components.
     n_lasers : int
@@ -475,10 +477,9 @@ def other_lines_share(
     lit = np.zeros((n_lasers, n_bins(line)), np.bool_)
     of_surface, others = 0.0, 0.0
     for i in range(source.shape[0]):
-        if behind[i]:
-            own[source[i]] = True
-        if on_target[i]:
-            own[source[i]] = True
+        c = of_candidate[i]
+        own[source[i]] |= members[c] or behind[c]
+        if members[c]:
             lit[laser[i], line[i]] = True
             of_surface += candidates.confidence[i]
     for i in range(source.shape[0]):
