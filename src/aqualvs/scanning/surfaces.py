@@ -194,8 +194,7 @@ def search_surfaces(
         by_laser, n = np.zeros((3, n_lasers)), 0
         if _find_plane(table, weight, laser, rows, n_lasers, nearest, farthest, found, plane):
             n = _collect_inliers(subsegments, rows, plane, mine, by_laser)
-        supporting = _sum_lasers(by_laser, sums[found])
-        is_plane = n >= min_subsegments and supporting >= 2 and sums[found, LINES] >= _MIN_LINES
+        is_plane = _sum_lasers(by_laser, sums[found]) and n >= min_subsegments
         light = sum_of(by_laser[INLIER_WEIGHT])
         if not is_plane or light < min_share * sum_of(intensity_weight):
             if found > 0 or again:
@@ -278,15 +277,15 @@ def _add_subsegment(subsegments: Subsegments, c: int, by_laser: FloatArray) -> N
 
 
 @inner_borrowing_kernel
-def _sum_lasers(by_laser: FloatArray, sums: FloatArray) -> int:
-    """Write the sums over all lasers (3,); return the number of lasers with enough lines."""
+def _sum_lasers(by_laser: FloatArray, sums: FloatArray) -> bool:
+    """Write the sums over all lasers (3,); return whether they are a surface's."""
     sums[LINES] = sum_of(by_laser[LINES])
     sums[INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
     sums[SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
     supporting = 0
     for i in range(by_laser.shape[1]):
         supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
-    return supporting
+    return supporting >= 2 and sums[LINES] >= _MIN_LINES
 
 
 @lazy_kernel
@@ -343,7 +342,7 @@ def collect_left_over(
     for c in range(members.shape[0]):
         if members[c]:
             _add_subsegment(subsegments, c, by_laser)
-    return _sum_lasers(by_laser, sums) >= 2 and sums[LINES] >= _MIN_LINES
+    return _sum_lasers(by_laser, sums)
 
 
 @lazy_borrowing_kernel
