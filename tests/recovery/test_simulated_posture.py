@@ -12,7 +12,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.simulation.render import Renderer
@@ -91,6 +91,12 @@ def errors(shot: Shot) -> tuple[float, float, float]:
     )
 
 
+def posture_by(rig: Rig, scene: Scene, t: float) -> Posture | Refusal:
+    """Render a scene as the camera of a rig sees it, and measure it."""
+    image = Renderer(rig, threads=2).render(scene, t, np.random.default_rng(3)).image
+    return Scanner(rig).process(frame_of(0, t, image)).posture
+
+
 def in_sigmas(shot: Shot) -> FloatArray:
     """Errors of range, pitch and yaw over their sigmas."""
     share, pitch, yaw = errors(shot)
@@ -131,8 +137,7 @@ def test_two_long_stripes_are_found_among_the_specks_of_caustics() -> None:
     pose = dome_from_target(0.9, np.deg2rad(3.0), np.deg2rad(-4.0))
     sun = WaterOptics(caustics=0.5, glare=0.3, ambient=(0.4, 0.6, 0.6))
     scene = Scene(dome_from_scene=pose, walls=(Wall(),), target="wall", water=sun)
-    image = Renderer(rig, threads=2).render(scene, 0.9, np.random.default_rng(3)).image
-    found = Scanner(rig).process(frame_of(0, 0.9, image)).posture
+    found = posture_by(rig, scene, 0.9)
     assert found, found
     assert found.range == pytest.approx(0.9, rel=3e-4)
 
@@ -246,8 +251,7 @@ def test_a_net_is_the_target_where_its_stripes_lie_on_other_lasers_of_the_wall()
         nets=(Net(bar=0.03),),
         target="net",
     )
-    image = Renderer(rig, threads=2).render(scene, 0.69, np.random.default_rng(3)).image
-    found = Scanner(rig).process(frame_of(0, 0.69, image)).posture
+    found = posture_by(rig, scene, 0.69)
     assert found, found
     assert found.range == pytest.approx(0.689, rel=2e-3)
 

@@ -289,6 +289,17 @@ def slanted_strands(points: FloatArray) -> BoolArray:
     return lit
 
 
+def every(one_of: int) -> Lit:
+    """Light on one in so many of the slanted strands."""
+
+    def lit(points: FloatArray) -> BoolArray:
+        number = (points[:, 0] + 0.4 * points[:, 2]) // 0.03
+        on: BoolArray = slanted_strands(points) & (number % one_of == 0)
+        return on
+
+    return lit
+
+
 def few_strands(points: FloatArray) -> BoolArray:
     lit: BoolArray = (points[:, 0] + 0.4 * points[:, 2]) % 0.15 < 0.03
     return lit
@@ -313,17 +324,10 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
         Its peaks have this share of the height of others.
         """
 
-        def seen_on(one_of: int | None) -> Lit:
-            def lit(points: FloatArray) -> BoolArray:
-                number = (points[:, 0] + 0.4 * points[:, 2]) // 0.03
-                on: BoolArray = slanted_strands(points) & (number % one_of == 0)
-                return on
-
-            return everywhere if one_of is None else lit
-
+        seen = [everywhere if one_of is None else every(one_of) for one_of in strands_of]
         of_net = [
-            peaks_of(replace(rig, lasers=(laser,)), [(net, seen_on(one_of))], 0.1)
-            for laser, one_of in zip(rig.lasers, strands_of, strict=False)
+            peaks_of(replace(rig, lasers=(laser,)), [(net, lit)], 0.1)
+            for laser, lit in zip(rig.lasers, seen, strict=False)
         ]
         low = [
             {axis: one._replace(height=height * one.height) for axis, one in peaks.items()}
@@ -331,8 +335,7 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
         ]
         candidates = find_candidates(joined([*low, *loose]), laser_bands, triangulator)
         subsegments, _ = candidates.subsegments()
-        seen = surface_on(net, subsegments, len(rig.lasers), 850.0)
-        target = replace(seen, is_mesh=True)
+        target = replace(surface_on(net, subsegments, len(rig.lasers), 850.0), is_mesh=True)
         return test.is_by_chance(candidates, subsegments, [target], target)
 
     # A third of the light, and an eighth of it on few strands.
@@ -361,15 +364,8 @@ def test_two_lasers_show_any_plane_evenly(one_of: int, is_chance: bool) -> None:
     rig = replace(rig, lasers=rig.lasers[:2])
     laser_bands, triangulator = plan_bands(rig, rig.camera()), Triangulator(rig, rig.camera())
     test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
-
-    def lit(points: FloatArray) -> BoolArray:
-        on: BoolArray = slanted_strands(points) & (
-            (points[:, 0] + 0.4 * points[:, 2]) // 0.03 % one_of == 0
-        )
-        return on
-
     net = Plane.from_normal((0.1, 1.0, 0.0), 0.5)
-    parts = [peaks_of(rig, [(net, lit)], 0.1)]
+    parts = [peaks_of(rig, [(net, every(one_of))], 0.1)]
     for x, z, distance in [(0.4, 0.2, 0.7), (-0.3, 0.2, 0.8), (0.1, 0.2, 0.4), (-0.2, -0.3, 0.6)]:
         for laser in rig.lasers:
             elsewhere = Plane.from_normal((x + 0.1 * (laser is rig.lasers[0]), 1.0, z), distance)
