@@ -52,6 +52,12 @@ def level(offset: float = -0.1) -> Laser:
     return Laser("level", Plane.from_normal([0.0, 0.0, 1.0], offset))
 
 
+def rising(height: float, tilt_deg: float) -> Laser:
+    """Return a laser whose sheet is `height` (m) above the camera, and rises towards the target."""
+    slope = np.tan(np.deg2rad(tilt_deg))
+    return Laser("rising", Plane.from_normal([0.0, -slope, 1.0], height))
+
+
 def expect(rig: Rig, wall: float) -> ExpectedError:
     return expected_posture_errors(rig, RigUncertainty.none(), (wall,))[0]
 
@@ -227,8 +233,16 @@ def test_what_makes_a_rig_useless(rig: Rig, words: str) -> None:
             "of the picture sees no water",
         ),
         (pinhole(upright(0.002), level(-0.002)), "put the lasers farther"),
+        # Their sheets cross 0.45 m ahead; 1 / wall + 1 / other is 2 tan(15) / 0.12.
+        (
+            pinhole(rising(0.12, -15.0), Laser("high", rising(-0.12, 15.0).plane)),
+            "On a wall from 300 to 863 mm, lasers 'rising' and 'high' could each have made",
+        ),
     ],
-    ids=["one", "near lost", "air", "narrow", "aside", "centre", "aspect", "lens ends", "baseline"],
+    ids=[
+        *("one", "near lost", "air", "narrow", "aside", "centre", "aspect", "lens ends"),
+        *("baseline", "exchanged"),
+    ],
 )
 def test_what_is_worth_a_warning(rig: Rig, words: str) -> None:
     findings = check_rig(rig)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from aqualvs.geometry.planes import Plane, Rays
+from aqualvs.geometry.planes import Plane, Rays, exchanged_plane
 
 COORDINATE = st.floats(-2.0, 2.0)
 VECTOR = st.tuples(COORDINATE, COORDINATE, COORDINATE).map(np.array)
@@ -96,3 +96,24 @@ def test_points_along_rays() -> None:
     rays = rays_from([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     expected = [[1.0, 0.0, 2.0], [3.0, 1.0, 0.0]]
     np.testing.assert_array_equal(rays.points_at(np.array([2.0, 3.0])), expected)
+
+
+def test_two_stripes_share_a_plane_with_their_lasers_exchanged_too() -> None:
+    wall = Plane.from_normal((0.1, 1.0, -0.2), 0.8)
+    sheets = (
+        Plane.from_normal((0.05, -0.24, 1.0), -0.15),
+        Plane.from_normal((-0.1, 0.14, 1.0), 0.12),
+    )
+    other = exchanged_plane(wall, *sheets)
+    assert other is not None
+    for sheet, read_as in (sheets, sheets[::-1]):
+        # Two points of the stripe, and the points of the other sheet that are seen there.
+        system = np.array([wall.normal, sheet.normal, [1.0, 0.0, 0.0]])
+        for x in (-0.2, 0.3):
+            point = np.linalg.solve(system, [wall.offset, sheet.offset, x])
+            seen = point * read_as.offset / (read_as.normal @ point)
+            assert other.signed_distance(seen) == pytest.approx(0.0, abs=1e-12)
+    back = exchanged_plane(other, *sheets)
+    assert back is not None
+    np.testing.assert_allclose(back.packed(), wall.packed(), atol=1e-12)
+    assert exchanged_plane(wall, Plane(wall.normal, 0.0), sheets[0]) is None

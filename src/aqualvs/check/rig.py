@@ -26,7 +26,7 @@ from aqualvs.check.finding import (
     shutter_finding,
 )
 from aqualvs.errors import RigError
-from aqualvs.geometry.planes import Rays
+from aqualvs.geometry.planes import Plane, Rays, exchanged_plane
 from aqualvs.optics.camera import POSE_PARAMETERS, Camera
 from aqualvs.optics.expected_error import StripeView, visible_stripe
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty, laser_parameter_names
@@ -41,6 +41,7 @@ from aqualvs.optics.solved import (
     rig_uncertainty,
     solved_steps,
 )
+from aqualvs.scanning.plane_search import MIN_FACING
 from aqualvs.text import Finding, Severity, count_text
 
 SURFACES = "surfaces"
@@ -284,6 +285,7 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
         _check_index(rig),
         *_check_lasers(rig, camera),
         *_check_pairs(rig.lasers),
+        *_check_exchange(rig),
         *([] if shutter is None else [shutter]),
         *check_solved(rig, solved_steps(rig), uncertainty, now or datetime.now(UTC)),
         *check_errors(expected_errors(rig, completed_uncertainty(rig))),
@@ -478,6 +480,28 @@ def _check_pair(a: Laser, b: Laser) -> Finding:
             "determines the tilt across them."
         )
     return Finding.ok(f"{pair} meet at {angle:.0f} degrees.")
+
+
+def _check_exchange(rig: Rig) -> Iterator[Finding]:
+    """Yield a finding on walls on which two lasers alone may be taken for each other."""
+    if len(rig.lasers) != 2:
+        return
+    near, far = rig.working_range
+    first, second = rig.lasers
+    n_ranges = 43
+    ahead = np.array([0.0, 1.0, 0.0])
+    mixed = []
+    for wall in np.geomspace(near, far, n_ranges).tolist():
+        other = exchanged_plane(Plane(ahead, wall), first.plane, second.plane)
+        if other is not None and near <= other.offset <= far and other.normal[1] >= MIN_FACING:
+            mixed.append(wall)
+    if mixed:
+        yield Finding.warn(
+            f"On a wall from {mixed[0] * 1e3:.0f} to {mixed[-1] * 1e3:.0f} mm, lasers "
+            f"'{first.name}' and '{second.name}' could each have made the other's stripe, and "
+            "frames are refused as ambiguous; aim them so that they do not cross within the "
+            "working range, or add a third laser."
+        )
 
 
 def _verdict(findings: Sequence[Finding]) -> str:

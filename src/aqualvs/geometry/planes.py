@@ -85,6 +85,33 @@ class Plane:
         return self
 
 
+def exchanged_plane(plane: Plane, first: Plane, second: Plane) -> Plane | None:
+    """Return the plane of two laser stripes if each is read as the other laser's.
+
+    Two sheets s·X = 1 and t·X = 1 meet a plane m·X = 1 in stripes, which are seen along lines of
+    sight through the origin. These meet the other sheet on the plane (s + t - m)·X = 1, so two
+    stripes alone do not tell which of the two planes is there.
+
+    Parameters
+    ----------
+    plane : Plane
+        On which the stripes are.
+    first, second : Plane
+        The sheets.
+
+    Returns
+    -------
+    Plane or None
+        Its offset is positive; None if it is infinitely far, or a sheet passes the origin.
+    """
+    offsets = np.array([first.offset, second.offset, plane.offset])
+    if not offsets.all():
+        return None
+    m = first.normal / offsets[0] + second.normal / offsets[1] - plane.normal / offsets[2]
+    length = float(np.linalg.norm(m))
+    return Plane(m / length, 1.0 / length) if length > 0.0 else None
+
+
 def upright_axes(normal: FloatArray) -> FloatArray:
     """Return axes on a plane in `dome`, the columns of a rotation (3, 3).
 
