@@ -139,6 +139,26 @@ def test_a_wall(target: Plane, grey: bool) -> None:
     assert found.n_water == example_rig().n_water
 
 
+def test_lines_whose_colour_is_lost_are_measured_by_luma() -> None:
+    """In turbid water the glow beside a line is as green as the line: no step of colour is left."""
+    wall, scanner = plane(0.55, 3.0, -5.0), Scanner(example_rig())
+    frame = frame_of(light_on(scanner.rig, [(wall, everywhere)], ALL), noise=2.0)
+    assert frame.chroma is not None
+    u, v = (np.full_like(frame.chroma[0], level) for level in (119, 117))
+    frame = replace(frame, chroma=(u, v))
+    assert not scanner.measure(frame.index, frame.time_s, scanner.detect(frame)).posture
+    peaks, found = scanner.scan(frame)
+    assert_posture(found.posture, wall)
+    # What is recorded measures the same again.
+    again = scanner.measure(frame.index, frame.time_s, peaks).posture
+    assert again
+    assert found.posture
+    assert again.range == found.posture.range
+    # With one of the lasers dark, colour would have to tell.
+    two = frame_of(light_on(scanner.rig, [(wall, everywhere)], (0, 1)), noise=2.0)
+    assert not scanner.process(replace(two, chroma=(u, v))).posture
+
+
 @pytest.mark.parametrize(
     ("wavelength", "bgr"), [(450.0, (1.0, 0.2, 0.1)), (650.0, (0.1, 0.2, 1.0))]
 )

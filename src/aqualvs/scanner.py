@@ -109,6 +109,7 @@ class _Stripes(NamedTuple):
     subsegments: Subsegments
     shapes: ComponentShapes  # Of the candidates' components.
     assignment: AssignmentTest
+    has_colour: bool  # Whether colour was evidence for the peaks.
 
 
 class _Choice(NamedTuple):
@@ -187,7 +188,42 @@ class Scanner:
                 f"expected a Frame but got {type(frame).__name__}; make one of an image by "
                 "aqualvs.Frame(index, time_s, *aqualvs.planes_of_image(image))"
             )
-        return self.measure(frame.index, frame.time_s, self.detect(frame))
+        return self.scan(frame)[1]
+
+    def scan(self, frame: Frame) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
+        """Return the peaks of a frame as well as what `process` does. Raises as `detect`."""
+        peaks = self.detect(frame)
+        return self.without_colour(frame, peaks, self.measure(frame.index, frame.time_s, peaks))
+
+    def without_colour(
+        self, frame: Frame, peaks: dict[SearchAxis, StripePeaks], scan: Scan
+    ) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
+        """Measure a frame once more by luma if its colours leave hardly a stripe.
+
+        Codecs drop the chroma of short dashes, and in turbid water the glow beside a line is as
+        green as the line.
+
+        Parameters
+        ----------
+        frame : Frame
+        peaks : dict
+            From `detect`.
+        scan : Scan
+            From `measure` with these peaks.
+
+        Returns
+        -------
+        peaks, scan
+            By luma if that gives a posture that is certain without colour; else as given.
+        """
+        hardly_any = (Reason.NO_STRIPES, Reason.TOO_FEW_POINTS, Reason.NOT_A_PLANE)
+        refusal = scan.posture
+        by_colour = frame.chroma is not None and isinstance(self.options.detector, StripeOptions)
+        if not by_colour or refusal or refusal.reason not in hardly_any:
+            return peaks, scan
+        by_luma = self.detect(replace(frame, chroma=None))
+        again = self.measure(frame.index, frame.time_s, by_luma, has_colour=False)
+        return (by_luma, again) if again.posture else (peaks, scan)
 
     def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
         """Find the sub-pixel peaks along the search lines, within the lasers' bands.
@@ -205,7 +241,14 @@ class Scanner:
             )
         return self._search(frame.index).detector.detect(frame)
 
-    def measure(self, index: int, time_s: float, peaks: dict[SearchAxis, StripePeaks]) -> Scan:
+    def measure(
+        self,
+        index: int,
+        time_s: float,
+        peaks: dict[SearchAxis, StripePeaks],
+        *,
+        has_colour: bool = True,
+    ) -> Scan:
         """Measure the posture from the peaks of one frame.
 
         Parameters
@@ -216,17 +259,19 @@ class Scanner:
             Of the frame.
         peaks : dict
             From `detect`; recorded peaks give the same result as their frame.
+        has_colour : bool
+            If false, the target must be certain without colour.
         """
         # Candidates: each peak as a point of every laser that could have made it.
         search = self._search(index)
         candidates = find_candidates(peaks, search.laser_bands, self._triangulator)
-        measurement, points, rows = self._estimate(candidates, search.assignment)
+        measurement, points, rows = self._estimate(candidates, search.assignment, has_colour)
         if self._paper_filter is not None:
             # The paper's filter needs the laser of each peak, which is known by now.
             kept = np.zeros(candidates.n, np.bool_)
             kept[rows] = _on_mesh(self._paper_filter, points)
             candidates = candidates.where(kept)
-            measurement, points, _ = self._estimate(candidates, search.assignment)
+            measurement, points, _ = self._estimate(candidates, search.assignment, has_colour)
         posture = self._with_rig_covariance(measurement, candidates)
         return Scan(index, time_s, posture, points, self.rig.n_water)
 
@@ -263,7 +308,7 @@ class Scanner:
         return RowMotion(self.rig)
 
     def _estimate(
-        self, candidates: Candidates, assignment: AssignmentTest
+        self, candidates: Candidates, assignment: AssignmentTest, has_colour: bool
     ) -> tuple[Measurement, ScanPoints, IntArray]:
         """Return the posture, the labelled points, and the rows of their candidates."""
         # Planes that several lasers agree on.
@@ -276,7 +321,7 @@ class Scanner:
             self.rig.focal_px,
         )
         # The target among them, and the posture from its points outside crossing zones.
-        stripes = _Stripes(candidates, subsegments, shapes, assignment)
+        stripes = _Stripes(candidates, subsegments, shapes, assignment, has_colour)
         choice = self._choose_target(stripes, surfaces)
         measurement = self._measure_target(stripes, choice)
         other = _as_other_kind(choice.target, measurement, self.rig.focal_px)
@@ -314,7 +359,7 @@ class Scanner:
         surfaces, target, overlooked = self._best_target(stripes, surfaces)
         if target is None:
             return _Choice(surfaces)
-        candidates, subsegments, _, assignment = stripes
+        candidates, subsegments, _, assignment, _ = stripes
         outcome = assignment.test(candidates, subsegments, target)
         return _Choice(surfaces, target, overlooked, outcome)
 
@@ -323,10 +368,15 @@ class Scanner:
     ) -> tuple[list[Surface], Surface | None, Surface | None]:
         """Return the surfaces, the target, and a nearer surface that may be the net instead."""
         kind = self.options.target
+        candidates, subsegments, _, assignment, _ = stripes
         target = choose_target(surfaces, kind, self.rig.working_range)
+        while target is not None and len(surfaces) > 1:
+            if not assignment.may_be_exchanged(subsegments, target):
+                break
+            surfaces = [one for one in surfaces if one is not target]
+            target = choose_target(surfaces, kind, self.rig.working_range)
         if target is None or kind is not TargetKind.AUTO:
             return surfaces, target, None
-        candidates, subsegments, _, assignment = stripes
         nearer = assignment.overlooked(candidates, subsegments, surfaces, target)
         if nearer is None or not nearer.is_mesh:
             return surfaces, target, nearer
@@ -334,7 +384,7 @@ class Scanner:
 
     def _measure_target(self, stripes: _Stripes, choice: _Choice) -> Measurement:
         """Return the posture to the target, or the refusal."""
-        candidates, subsegments, _, assignment = stripes
+        candidates, subsegments, _, assignment, _ = stripes
         surfaces, target, _, tested = choice
         if target is None:
             missing = _no_target(candidates, surfaces, self.options.target)
@@ -351,11 +401,16 @@ class Scanner:
 
     def _refusal(self, stripes: _Stripes, choice: _Choice, target: Surface) -> Refusal | None:
         """Return the refusal of a target that is ambiguous or found by chance; else None."""
-        candidates, subsegments, _, assignment = stripes
+        candidates, subsegments, _, assignment, _ = stripes
         if choice.overlooked is not None:
             return _ambiguous(target.plane, choice.overlooked.plane)
         if assignment.is_by_chance(candidates, subsegments, choice.surfaces, target):
             detail = "the best plane is small, and lasers that should be seen on it are not"
+            return Refusal(Reason.NOT_A_PLANE, detail)
+        if not stripes.has_colour and not assignment.is_certain(
+            candidates, subsegments, choice.surfaces, target
+        ):
+            detail = "without colour, the lasers do not show the best plane evenly enough"
             return Refusal(Reason.NOT_A_PLANE, detail)
         if choice.tested.verdict is Verdict.AMBIGUOUS and choice.tested.other is not None:
             return _ambiguous(target.plane, choice.tested.other)

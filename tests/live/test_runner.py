@@ -197,8 +197,9 @@ class _Waiting:
         assert self.let_go.wait(TIMEOUT_S)
         return demo_scanner().detect(frame)
 
-    def measure(self, index: int, time_s: float, peaks: object) -> Scan:
-        return demo_scanner().measure(index, time_s, peaks)  # type: ignore[arg-type]
+    def scan(self, frame: Frame) -> tuple[object, Scan]:
+        peaks = self.detect(frame)
+        return peaks, demo_scanner().measure(frame.index, frame.time_s, peaks)  # type: ignore[arg-type]
 
 
 def test_a_source_faster_than_the_pipeline_costs_frames_but_no_delay(
@@ -284,8 +285,9 @@ class _Stumbling:
             raise ZeroDivisionError("bad luck")
         return demo_scanner().detect(frame)
 
-    def measure(self, index: int, time_s: float, peaks: object) -> Scan:
-        return demo_scanner().measure(index, time_s, peaks)  # type: ignore[arg-type]
+    def scan(self, frame: Frame) -> tuple[object, Scan]:
+        peaks = self.detect(frame)
+        return peaks, demo_scanner().measure(frame.index, frame.time_s, peaks)  # type: ignore[arg-type]
 
 
 def test_a_frame_that_the_scanner_fails_on_ends_nothing() -> None:

@@ -8,8 +8,8 @@ from hypothesis.extra.numpy import arrays
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.linear_algebra import lower_quantile
+from aqualvs.scanning.candidates import lit_cells, number_cells
 from aqualvs.scanning.plane_search import _guide, _median_weight, _pick
-from aqualvs.scanning.surfaces import lit_cells, number_cells
 
 # Repeated values among them, and such as leave the others in one bin.
 VALUES = st.floats(-300.0, 300.0) | st.sampled_from([0.0, 12.0, 12.5, -1e30, 1e300, np.inf, np.nan])

@@ -125,7 +125,8 @@ def subsegments_on(laser: IntArray, line: IntArray, points: FloatArray) -> Subse
     table[:3] = points.T
     table[6] = 5.0
     n, light = len(laser), np.full(len(laser), 5.0)
-    return Subsegments(np.arange(n), table, light, np.full(n, 5), line, line + 4, laser)
+    width, n_lines = np.full(n, 4.0), np.full(n, 5)
+    return Subsegments(np.arange(n), table, light, width, n_lines, line, line + 4, laser)
 
 
 def two_surfaces(second: BoolArray, height: FloatArray) -> Subsegments:

@@ -455,8 +455,7 @@ class LiveRunner:
             refusal = Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s", still_s)
         else:
             try:
-                peaks = scanner.detect(frame)
-                scan = scanner.measure(frame.index, frame.time_s, peaks)
+                peaks, scan = scanner.scan(frame)
                 return peaks, self._at_middle(scan, rig, arrival.arrived_ns)
             except Exception as fault:
                 # One bad frame must not end a dive.

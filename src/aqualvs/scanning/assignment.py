@@ -26,7 +26,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import lazy_kernel
 from aqualvs.geometry.linear_algebra import n_bins
-from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.planes import Plane, exchanged_plane
 from aqualvs.scanning.assignment_kernels import (
     CELL_LINES,
     DARK,
@@ -42,11 +42,12 @@ from aqualvs.scanning.assignment_kernels import (
     judge_planes,
     loose_share_before,
     stripe_visibility,
+    two_longest_stripes,
 )
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.net_surfaces import inflate_covariance, seen_through
-from aqualvs.scanning.plane_search import WEIGHT, X, Z
+from aqualvs.scanning.plane_search import MIN_FACING, WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.segments import ComponentShapes, is_straight
@@ -62,10 +63,12 @@ class _AssignmentOptions(NamedTuple):
     show it.
     """
 
-    # Log-odds of a laser that is dark though it should be visible (7 %), and of a false stripe as
-    # good as the others (5 %); odds of 20 to 1 decide.
+    # Log-odds of a laser that is dark though it should be visible (7 %), of a false stripe as good
+    # as the others (5 %), and of a third stripe that is on the plane of two by chance (13 %); odds
+    # of 20 to 1 decide.
     dark_laser: float = 2.6
     foreign_stripe: float = 3.0
+    third_stripe: float = 2.0
     decided: float = 3.0
     # Residuals of half stripes count as at most this many independent ones, because errors of the
     # rig are not noise. Then the limit of the evidence from residuals, in log-odds.
@@ -78,9 +81,15 @@ class _AssignmentOptions(NamedTuple):
     small_share: float = 0.12
     short_visible: float = 0.15
     may_be_faint: float = 0.25
+    # Least extent of the gappy stripes of a net that may hang in front of all of a solid target, as
+    # a share of the target's search lines: fish have 0.5 at most.
+    min_extent: float = 0.6
     # Least visible share of the best stripe of a surface with so little light: 0.12 to 0.25 on
     # nets, 0.05 to 0.09 where strands in daylight make a plane by chance.
     min_visible: float = 0.1
+    # Least share of the light of a surface if colour is no evidence: nets whose dashes lost their
+    # chroma have 0.18 to 0.26.
+    certain_share: float = 0.15
     # With less light than this, a surface is there by chance whatever else it shows: specks of a
     # fouled net that made a plane at a third of its range had 0.05, 1,100 nets and walls in
     # rendered dives 0.075 and more.
@@ -103,6 +112,10 @@ class _AssignmentOptions(NamedTuple):
     # floor close below the vehicle, are tilted by 44 to 61 degrees.
     two_alone: float = 0.1
     steep: float = 0.8
+    # In a rig of two lasers that cross in the working range, walls beyond it make planes tilted by
+    # 34 to 60 degrees. No light returns from beyond this many times the range.
+    steep_of_two: float = 0.87
+    max_lit: float = 3.0
 
 
 _ODDS = _AssignmentOptions()
@@ -155,6 +168,7 @@ class AssignmentTest:
         self._searched = searched
         self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.bool_)
         self._bands = _sample_bands(laser_bands, triangulator)
+        self._sheets = [Plane(row[:3], float(row[3])) for row in triangulator.planes]
 
     def is_by_chance(
         self,
@@ -191,6 +205,25 @@ class AssignmentTest:
         )
         return (outweighed or _is_small(target, share, visible)) and faint > _ODDS.may_be_faint
 
+    def is_certain(
+        self,
+        candidates: Candidates,
+        subsegments: Subsegments,
+        surfaces: Sequence[Surface],
+        target: Surface,
+    ) -> bool:
+        """Return whether a surface is there although colour does not tell: all lasers show it.
+
+        Parameters
+        ----------
+        candidates, subsegments, surfaces, target
+            As in `is_by_chance`.
+        """
+        share = self._light_share(candidates, subsegments, surfaces, target)
+        visible, faint, _ = self._visibility(target, subsegments)
+        few, is_bright = 3, share >= _ODDS.certain_share and visible >= _ODDS.small_share
+        return is_bright and faint == 0.0 and _n_lasers_on(target, subsegments) >= few
+
     def overlooked(
         self,
         candidates: Candidates,
@@ -224,11 +257,13 @@ class AssignmentTest:
             if one is target or not may_be_net or not _is_nearer(one, target, subsegments):
                 continue
             share = self._light_share(candidates, subsegments, surfaces, one)
-            visible, faint, _ = self._visibility(one, subsegments)
+            # As wide as the target, it may be a net one of whose strands lies along a sheet.
+            is_wide = one.extent >= _ODDS.min_extent * target.n_lines
+            visible, faint, _ = self._visibility(one, subsegments, along_strand=is_wide)
             if _is_small(one, share, visible) or faint > _ODDS.may_be_faint:
                 continue
-            is_net = one.is_mesh or seen_through(one.members, target.members, subsegments)
-            return replace(one, is_mesh=is_net)
+            is_mesh = one.is_mesh or seen_through(one.members, target.members, subsegments)
+            return replace(one, is_mesh=is_mesh)
         return None
 
     def may_hide_net(
@@ -263,9 +298,9 @@ class AssignmentTest:
             self._searched[0],
         )
         # Loose light in front of something solid, over its own light. Rendered walls have 0.01 at
-        # most, real ones with 15 lasers, whose lines are nearly hidden by noise, 0.09; walls behind
-        # a folded net have 0.21 to 0.83, half of them 0.32 and more.
-        max_loose_share = 0.25
+        # most, among fish, bubbles and caustics 0.19, real ones with 15 lasers, whose lines are
+        # nearly hidden by noise, 0.09; walls behind a folded net have 0.21 to 0.83.
+        max_loose_share = 0.21
         return bool(share > max_loose_share)
 
     def other_lines(
@@ -308,25 +343,31 @@ class AssignmentTest:
         return share if share > most else None
 
     def may_be_exchanged(self, subsegments: Subsegments, target: Surface) -> bool:
-        """Return whether a solid target may be two lasers' stripes, each read as the other's.
+        """Return whether a target may be two lasers' stripes, each read as the other's.
 
-        Two straight stripes on a plane share one with their lasers exchanged, too: both pass the
-        point in which the line of sight to their crossing meets the line in which the sheets meet.
-        Only a third laser decides, and if it should be visible on a steep target and is not, the
-        stripes may be those of a floor or a side wall nearer than the working range.
+        Only a third laser decides (`exchanged_plane`). If it should be visible on the target and is
+        not, the stripes may be those of a wall out of the working range, or, on a steep solid
+        target, of a floor or a side wall nearer than that. Without a third laser the less steep
+        plane is more likely.
 
         Parameters
         ----------
         subsegments, target
             As in `is_by_chance`.
         """
-        if target.is_mesh or target.plane.normal[1] > _ODDS.steep:
+        n_lasers, facing = len(self._sheets), target.plane.normal[1]
+        first, second, of_others = two_longest_stripes(subsegments, target.members, n_lasers)
+        if of_others >= _ODDS.two_alone:
             return False
-        on_target = target.members
-        n_lines = np.bincount(subsegments.laser[on_target], subsegments.n_lines[on_target])
-        if np.sort(n_lines)[:-2].sum() >= _ODDS.two_alone * n_lines.sum():
-            return False
-        return self._is_faint(target, subsegments)
+        other = exchanged_plane(target.plane, self._sheets[first], self._sheets[second])
+        other_facing = -1.0 if other is None else other.normal[1]
+        nearest, farthest = self._searched
+        may_be_lit = other is not None and nearest <= other.offset <= _ODDS.max_lit * farthest
+        may_be_lit = may_be_lit and other_facing >= MIN_FACING
+        if n_lasers == 2:
+            return bool(may_be_lit and facing < min(other_facing, _ODDS.steep_of_two))
+        is_steep = not target.is_mesh and facing <= _ODDS.steep
+        return bool(may_be_lit or is_steep) and self._is_faint(target, subsegments)
 
     def _light_share(
         self,
@@ -355,10 +396,12 @@ class AssignmentTest:
         _, faint, _ = self._visibility(surface, subsegments)
         return faint > _ODDS.may_be_faint
 
-    def _visibility(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float, float]:
+    def _visibility(
+        self, surface: Surface, subsegments: Subsegments, *, along_strand: bool = False
+    ) -> tuple[float, float, float]:
         """Return visible share of a surface's best stripe; shares of faint and of dark lasers."""
         found: tuple[float, float, float] = stripe_visibility(
-            surface.plane.packed(), surface.members, subsegments, self._bands
+            surface.plane.packed(), surface.members, subsegments, self._bands, along_strand
         )
         return found
 
@@ -545,6 +588,8 @@ def _log_odds(one: FloatArray, other: FloatArray) -> float:
     more = one if one[INTENSITY_WEIGHT] > other[INTENSITY_WEIGHT] else other
     foreign = (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / max(more[PER_LASER], 1e-9)
     dark = _ODDS.dark_laser * (other[DARK] - one[DARK])
+    # Two stripes share a plane with any assignment, a third one only by chance.
+    third = _ODDS.third_stripe * (float(_n_lit(one) > 2) - float(_n_lit(other) > 2))
     freedom = min(one[FREEDOM], other[FREEDOM], _ODDS.max_freedom)
     residuals = 0.0
     if freedom > 0.0:
@@ -552,8 +597,14 @@ def _log_odds(one: FloatArray, other: FloatArray) -> float:
     return float(
         _ODDS.foreign_stripe * foreign
         + dark
+        + third
         + min(max(residuals, -_ODDS.max_by_residuals), _ODDS.max_by_residuals)
     )
+
+
+def _n_lit(measures: FloatArray) -> int:
+    """Return the number of lasers with a stripe on a hypothesis."""
+    return round(float(measures[INTENSITY_WEIGHT] / max(measures[PER_LASER], 1e-9)))
 
 
 def _alike(

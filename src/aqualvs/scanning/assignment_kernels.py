@@ -13,7 +13,7 @@ from aqualvs.geometry.compiled import (
     inner_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import flatnonzero, n_bins, solve_symmetric, squared
+from aqualvs.geometry.linear_algebra import flatnonzero, n_bins, solve_symmetric, squared, sum_of
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.plane_search import (
     JX,
@@ -580,8 +580,41 @@ def loose_share_before(
 
 
 @lazy_kernel
+def two_longest_stripes(
+    subsegments: Subsegments, members: BoolArray, n_lasers: int
+) -> tuple[int, int, float]:
+    """Return the two lasers with most search lines on a surface, and the share of the others'.
+
+    Parameters
+    ----------
+    subsegments : Subsegments
+        C of them.
+    members : bool array, shape (C,)
+        Those on the surface.
+    n_lasers : int
+        Lasers of the rig, two at least.
+    """
+    lines = np.zeros(n_lasers)
+    for c in range(members.shape[0]):
+        if members[c]:
+            lines[subsegments.laser[c]] += subsegments.n_lines[c]
+    first, second = 0, -1
+    for i in range(1, n_lasers):
+        if lines[i] > lines[first]:
+            first, second = i, first
+        elif second < 0 or lines[i] > lines[second]:
+            second = i
+    total = sum_of(lines)
+    return first, second, (total - lines[first] - lines[second]) / max(total, 1e-12)
+
+
+@lazy_kernel
 def stripe_visibility(
-    plane: FloatArray, members: BoolArray, subsegments: Subsegments, bands: FloatArray
+    plane: FloatArray,
+    members: BoolArray,
+    subsegments: Subsegments,
+    bands: FloatArray,
+    along_strand: bool,
 ) -> tuple[float, float, float]:
     """Return the visible share of a surface's best stripe; shares of faint and of dark lasers.
 
@@ -598,6 +631,9 @@ def stripe_visibility(
         C of them.
     bands
         As in `judge_planes`.
+    along_strand : bool
+        Whether the best stripe may lie along a strand: lasers are then faint beside the second
+        best one.
     """
     laser = subsegments.laser
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
@@ -606,16 +642,17 @@ def stripe_visibility(
     for c in range(laser.shape[0]):
         if members[c]:
             visible[laser[c]] += subsegments.n_lines[c]
-    most, asked, faint, dark = 0.0, 0, 0, 0
+    most, second, asked, faint, dark = 0.0, 0.0, 0, 0, 0
     for i in range(n_lasers):
         cells = flatnonzero(expected[i]).shape[0]
         visible[i] = visible[i] / (CELL_LINES * cells) if cells >= _LIGHT.min_cells else np.nan
-        if visible[i] > most:
-            most = visible[i]
+        if visible[i] == visible[i]:
+            second = max(second, min(most, visible[i]))
+            most = max(most, visible[i])
     for i in range(n_lasers):
         if visible[i] == visible[i]:
             asked += 1
-            faint += visible[i] < _LIGHT.faint * most
+            faint += visible[i] < _LIGHT.faint * (second if along_strand else most)
             dark += visible[i] == 0.0
     return most, faint / max(asked, 1), dark / max(asked, 1)
 

@@ -3,6 +3,10 @@
 `find_candidates` links each laser's peaks (`StripePeaks`) to segments and triangulates them; the
 result, `Candidates`, holds the candidate correspondences of peaks and lasers. `Subsegments`
 summarises them: a subsegment as a whole lies on a surface or does not.
+
+Cells of the image identify light: one peak yields candidates of several lasers, and one stripe may
+be found by two search directions, so candidates in or next to a cell in which a surface has
+candidates count as the same light (`number_cells`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, U8Array
 from aqualvs.geometry.compiled import (
     ZERO,
     inline_borrowing_kernel,
@@ -60,6 +64,8 @@ class Subsegments(NamedTuple):
     table: FloatArray
     # Shape (C,): sum of its candidates' confidences, in search lines.
     intensity_weight: FloatArray
+    # Shape (C,): mean width of its peaks, in pixels.
+    width: FloatArray
     # Shape (C,): search lines in it.
     n_lines: IntArray
     # Shape (C,): its first and last search line.
@@ -118,9 +124,9 @@ class Candidates(NamedTuple):
         """Summarise the subsegments by their centroids; describe the components by their shapes."""
         n = count_subsegments(self.subsegment)
         of_candidate, numbers = np.empty(self.n, np.int64), np.empty((4, n), np.int64)
-        table, intensity_weight = np.empty((7, n)), np.empty(n)
-        shapes = summarise_subsegments(self, of_candidate, table, intensity_weight, numbers)
-        found = Subsegments(of_candidate, table, intensity_weight, *numbers)
+        table, intensity_weight, width = np.empty((7, n)), np.empty(n), np.empty(n)
+        shapes = summarise_subsegments(self, of_candidate, table, intensity_weight, width, numbers)
+        found = Subsegments(of_candidate, table, intensity_weight, width, *numbers)
         return found, ComponentShapes(*shapes)
 
 
@@ -209,6 +215,7 @@ def summarise_subsegments(
     of_candidate: IntArray,
     table: FloatArray,
     intensity_weight: FloatArray,
+    width: FloatArray,
     numbers: IntArray,
 ) -> FloatArray:
     """Summarise N candidates in C subsegments.
@@ -219,7 +226,7 @@ def summarise_subsegments(
         N of them.
     of_candidate : int array, shape (N,)
     table : array, shape (7, C)
-    intensity_weight : array, shape (C,)
+    intensity_weight, width : array, shape (C,)
         Written, as in `Subsegments`.
     numbers : int array, shape (4, C)
         Written: n_lines, first_line, last_line and laser of `Subsegments`.
@@ -236,10 +243,11 @@ def summarise_subsegments(
             of_candidate[i] = c
         numbers[0, c], numbers[1, c], numbers[2, c] = end - begin, line[begin], line[end - 1]
         numbers[3, c] = candidates.laser[begin]
-        total = 0.0
+        total, wide = 0.0, 0.0
         for i in range(begin, end):
             total += candidates.confidence[i]
-        intensity_weight[c] = total
+            wide += candidates.width[i]
+        intensity_weight[c], width[c] = total, wide / (end - begin)
         _write_centroid(candidates, begin, end, table, c)
         begin = end
     shapes = describe_components(
@@ -307,6 +315,79 @@ def _write_sampling_weights(
         if is_curved(shapes, s):
             sampling_weight[c] *= curved_weight
         begin += n_lines[c]
+
+
+# Marks of a cell: light in a neighbouring cell, or in the cell itself.
+_BESIDE, _MIDDLE = np.uint8(1), np.uint8(2)
+# Cells have six pixels. Division by six is a multiplication and a shift, exact for integers below
+# 100,000.
+_SIXTH_BITS = 18
+_SIXTH = (1 << _SIXTH_BITS) // 6 + 1
+
+
+@inline_borrowing_kernel
+def _cell(coordinate: float) -> int:
+    """Return the row or column of the cell of a coordinate (px), from 1: cell 0 is a margin."""
+    return (int(max(coordinate, 0.0)) * _SIXTH >> _SIXTH_BITS) + 1
+
+
+@inner_kernel
+def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
+    """Write the number of the cell in which each of N candidates lies.
+
+    Parameters
+    ----------
+    pixels : array, shape (N, 2)
+        In `image`.
+    cell : int array, shape (N,)
+        Written.
+
+    Returns
+    -------
+    n_cells, n_columns : int
+        Cells in total, and in a row; cells are numbered row by row.
+    """
+    right, low = 0.0, 0.0
+    for i in range(pixels.shape[0]):
+        right, low = max(right, pixels[i, 0]), max(low, pixels[i, 1])
+    n_columns = _cell(right) + 2
+    for i in range(pixels.shape[0]):
+        cell[i] = _cell(pixels[i, 1]) * n_columns + _cell(pixels[i, 0])
+    return (_cell(low) + 2) * n_columns, n_columns
+
+
+@inline_borrowing_kernel
+def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
+    """Mark a cell and the eight around it with nonzero values in `lit`, shape (n_cells,)."""
+    if lit[middle] == _MIDDLE:
+        return
+    for row in (middle - n_columns, middle, middle + n_columns):
+        for near in range(row - 1, row + 2):
+            lit[near] = max(lit[near], _BESIDE)
+    lit[middle] = _MIDDLE
+
+
+@inner_kernel
+def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
+    """Mark the cells with explained candidates, and those around them.
+
+    Parameters
+    ----------
+    cell, n_cells, n_columns
+        From `number_cells`.
+    explained : bool array, shape (N,)
+        Candidates that lie on a surface.
+
+    Returns
+    -------
+    uint8 array, shape (n_cells,)
+        Nonzero in marked cells.
+    """
+    lit = np.zeros(n_cells, np.uint8)
+    for i in range(cell.shape[0]):
+        if explained[i]:
+            mark_cells(cell[i], n_columns, lit)
+    return lit
 
 
 # Quantile of the heights of a frame's peaks that is the height of the best ones.

@@ -19,14 +19,14 @@ from aqualvs.geometry.compiled import (
 )
 from aqualvs.geometry.linear_algebra import lower_quantile, n_bins
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Candidates, Subsegments
+from aqualvs.scanning.candidates import Candidates, Subsegments, lit_cells, number_cells
 from aqualvs.scanning.patch import height_over, packed_plane
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.region_growing import recruit_candidates
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.segments import ComponentShapes, is_bent, is_round, is_straight
-from aqualvs.scanning.surfaces import Surface, lit_cells, number_cells
+from aqualvs.scanning.surfaces import Surface
 
 # Numba compiles plain numbers faster than members of an enumeration.
 _NET, _SOLID, _FISH = np.uint8(Label.NET), np.uint8(Label.SOLID), np.uint8(Label.FISH)

@@ -318,9 +318,12 @@ class StripePattern(NamedTuple):
     # As on something solid, perhaps with gaps: on two lasers (or the only one with enough lines)
     # many search lines are in intervals longer than those on strands.
     is_unbroken: bool
+    # Number of lit intervals of the stripes that are broken as on a net.
+    n_strands: int
     # Search lines from end to end of the gappy stripes, summed over the lasers.
     extent: float
-    # Shape (n_lasers,): intensity weight in intervals as short as those on strands, not curved.
+    # Shape (n_lasers,): intensity weight in intervals as short or as narrow as those on strands,
+    # not curved.
     on_strands: FloatArray
 
 
@@ -347,10 +350,9 @@ def describe_pattern(
     StripePattern
     """
     on_strands = np.zeros(n_lasers)
-    is_mesh, is_gappy, is_unbroken, extent = _describe(
-        subsegments, members, min_lines, focal_px, on_strands
+    return StripePattern(
+        *_describe(subsegments, members, min_lines, focal_px, on_strands), on_strands
     )
-    return StripePattern(is_mesh, is_gappy, is_unbroken, extent, on_strands)
 
 
 @lazy_kernel
@@ -360,10 +362,10 @@ def _describe(
     min_lines: int,
     focal_px: float,
     on_strands: FloatArray,
-) -> tuple[bool, bool, bool, float]:
+) -> tuple[bool, bool, bool, int, float]:
     """Write the intensity weight on strands (n_lasers,); return the rest of a `StripePattern`."""
     asked, broken, gappy, long, unbroken, n_intervals = 0, 0, 0, 0, 0, 0
-    total = 0.0
+    total, n_strands = 0.0, 0
     # Largest duty of a mesh. The gaps of a net are longer than the lit strands; a wall behind a net
     # is lit between short shadows.
     mesh_duty = 0.6
@@ -381,11 +383,14 @@ def _describe(
         long += not is_short
         is_gappy = n >= _MIN_INTERVALS and is_short and duty < _GAPPY_DUTY
         gappy += is_gappy
-        broken += is_gappy and duty < mesh_duty
+        if is_gappy and duty < mesh_duty:
+            broken += 1
+            n_strands += n
         total += extent if is_gappy else 0.0
     few = not long and gappy == broken and n_intervals >= _FEW_INTERVALS
     enough = min(2, asked)
-    return broken >= enough or few, gappy >= enough or few, unbroken >= enough, total
+    is_mesh, is_gappy = broken >= enough or few, gappy >= enough or few
+    return is_mesh, is_gappy, unbroken >= enough, n_strands, total
 
 
 @inner_kernel
@@ -422,6 +427,7 @@ def _describe_stripe(
     first_line, last_line = subsegments.first_line, subsegments.last_line
     n = order.shape[0]
     lit, dark, distance, bright = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    wide = np.zeros(n)
     n_intervals = 0
     begin = first_line[order[0]]
     end = last_line[order[0]] + 1
@@ -440,6 +446,7 @@ def _describe_stripe(
         end = max(end, last_line[c] + 1)
         if table[WEIGHT, c] > curved_weight * intensity_weight[c]:
             bright[n_intervals] += intensity_weight[c]
+        wide[n_intervals] += subsegments.width[c] * subsegments.n_lines[c]
     extent = _extent(subsegments, order)
     gap = median_of(dark[:n_intervals]) if n_intervals else 0.0
     lit[n_intervals] = end - begin
@@ -448,10 +455,19 @@ def _describe_stripe(
     for k in range(n_intervals):
         dark[k] = lit[k]
     length = median_of(dark[:n_intervals])
+    short_lines, short_wide = 0.0, 0.0
+    for k in range(n_intervals):
+        if lit[k] * m_per_line < LONGEST_INTERVAL:
+            short_lines += lit[k]
+            short_wide += wide[k]
+    # A stripe along a strand is narrower than this share of the width of the light across strands:
+    # thin twine shows only a part of the sheet.
+    narrow_share = 0.7
+    narrow = narrow_share * short_wide / max(short_lines, 1.0)
     on_strands, all_lines, unbroken = 0.0, 0.0, 0.0
     for k in range(n_intervals):
         all_lines += lit[k]
-        if lit[k] * m_per_line < LONGEST_INTERVAL:
+        if lit[k] * m_per_line < LONGEST_INTERVAL or wide[k] < narrow * lit[k]:
             on_strands += bright[k]
         elif lit[k] * m_per_line > _UNBROKEN_LENGTHS * LONGEST_INTERVAL:
             unbroken += lit[k]

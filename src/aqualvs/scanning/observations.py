@@ -11,7 +11,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import n_bins, squared
+from aqualvs.geometry.linear_algebra import median_of, n_bins, squared
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, planes_and_bent, sheet_distance, sheets_of
@@ -305,12 +305,14 @@ def average_groups(
         np.empty(n, np.int64),
     )
     total, spread, full = np.zeros(n), np.zeros(n), np.zeros(n)
+    lines = np.zeros(n, np.int64)
     for i in range(group.shape[0]):
         c = group[i]
         if c < 0:
             continue
         intensity_weight = max(height[i] - floor[c], 0.0) * width[i]
         total[c] += intensity_weight
+        lines[c] += 1
         for k in range(3):
             seen.points[c, k] += intensity_weight * points[i, k]
             seen.sensitivity[c, k] += intensity_weight * candidates.sensitivity[i, k]
@@ -346,12 +348,54 @@ def average_groups(
         per_px = 0.0
         for k in range(3):
             per_px += normal[k] * seen.sensitivity[c, k]
-        scatter = spread[c] / (full[c] * per_px * per_px)
-        variance = seen.sigma_px[c] + squared(_SPREAD_SHARE) * scatter
+        # From here on a variance in px².
+        spread[c] /= full[c] * per_px * per_px
+        variance = seen.sigma_px[c] + squared(_SPREAD_SHARE) * spread[c]
         seen.sigma_px[c] = np.sqrt(variance + squared(_SUBSEGMENT_FLOOR_PX))
     if on_twine:
         _subtract_glow(seen, total)
+        _widen_along_strands(seen, lines, spread)
     return seen
+
+
+@inner_kernel
+def _widen_along_strands(seen: Observations, lines: IntArray, spread: FloatArray) -> None:
+    """Inflate the sigma of strands that lie along the sheet.
+
+    Such a strand need not cross the middle of the sheet: its light lies where the strand is. Thin
+    twine shows less than the sheet's full width there, and the rest is where the middle may be. A
+    strand that crosses all of the sheet at a small angle spreads as far as the sheet is wide.
+
+    Parameters
+    ----------
+    seen : Observations
+        M of them.
+    lines : int array, shape (M,)
+        Search lines of each.
+    spread : array, shape (M,)
+        Variance of the positions of its peaks about their mean, in px².
+    """
+    # A strand lies along the sheet if its light is longer than so many of its widths, and narrower
+    # than this share of the sheet.
+    along_widths, narrow_share = 4.0, 0.85
+    # Its distance from the sheet's middle, as a share of the width that it does not show: on
+    # rendered level nets 0.3 to 0.7. Standard deviation of the light on a strand that crosses all
+    # of the sheet, as a share of the sheet's width.
+    off_share, crossed_share = 0.6, 0.25
+    # The sheet's width is that of the light across strands, whatever the laser: light of others,
+    # assigned to one, may be narrower.
+    across, n = np.empty(lines.shape[0]), 0
+    for c in range(lines.shape[0]):
+        if lines[c] < along_widths * seen.width[c]:
+            across[n] = seen.width[c]
+            n += 1
+    sheet = median_of(across[:n]) if n else 0.0
+    for c in range(lines.shape[0]):
+        if lines[c] < along_widths * seen.width[c] or seen.width[c] > narrow_share * sheet:
+            continue
+        crossed = spread[c] / squared(crossed_share * sheet)
+        hidden = (sheet - seen.width[c]) * max(1.0 - crossed, 0.0)
+        seen.sigma_px[c] = np.sqrt(squared(seen.sigma_px[c]) + squared(off_share * hidden))
 
 
 @inner_kernel

@@ -92,8 +92,8 @@ def fit_over(
     n_on_plane = ZERO
     for i in range(n):
         by_pixel = GATE_PX * abs(per_px[i])
-        gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel)
         sigma[i] = abs(per_px[i]) * seen.sigma_px[i]
+        gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel + sigma[i] * sigma[i])
         n_on_plane += abs(height[i]) < gate[i]
         inside[i] = abs(height[i]) < gates * gate[i] if gates > 0.0 else inside[i]
     if not grow(terms, height, gate, inside, coefficients):

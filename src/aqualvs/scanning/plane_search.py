@@ -260,23 +260,34 @@ def _median_weight(sampling_weight: FloatArray) -> float:
 
 
 @inner_kernel
-def _heavy(sampling_weight: FloatArray) -> IntArray:
+def _heavy(sampling_weight: FloatArray, intensity_weight: FloatArray) -> IntArray:
     """Return the subsegments to sample: those not much below the weighted median.
 
-    Where glare makes thousands of specks, most neighbours on a stripe would be specks.
+    Where glare makes thousands of specks, most neighbours on a stripe would be specks. All are
+    sampled if the others have most of the intensity weight: on a wall in caustics, the sampling
+    weight of long stripes is limited to less than that of specks.
     """
     least = _LIGHTEST_SHARE * _median_weight(sampling_weight)
     heavy, n = np.empty(sampling_weight.shape[0], np.int64), 0
+    of_others = 0.0
     for c in range(sampling_weight.shape[0]):
         if sampling_weight[c] >= least:
             heavy[n] = c
             n += 1
-    return heavy[:n]
+        else:
+            of_others += intensity_weight[c]
+    most = 0.6  # Least share of the intensity weight.
+    if of_others < most * sum_of(intensity_weight):
+        return heavy[:n]
+    for c in range(sampling_weight.shape[0]):
+        heavy[c] = c
+    return heavy
 
 
 @inner_kernel
 def search_plane(
     table: FloatArray,
+    intensity_weight: FloatArray,
     laser: IntArray,
     laser_start: IntArray,
     nearest: float,
@@ -290,6 +301,8 @@ def search_plane(
     ----------
     table : array, shape (7, C)
         Subsegments, ordered by laser.
+    intensity_weight : array, shape (C,)
+        As in `Subsegments`.
     laser : int array, shape (C,)
         Index of each subsegment's laser.
     laser_start : int array, shape (n_lasers + 1,)
@@ -298,7 +311,8 @@ def search_plane(
         Limits of the hypotheses, in metres.
     seed : int
         The same seed and subsegments give the same plane. With 0, for the first plane of a frame,
-        all subsegments are sampled if the heavy ones are of one laser.
+        all subsegments are sampled if the heavy ones are of one laser, or have little of the
+        intensity weight.
     best_plane : array, shape (4,)
         Written: unit normal, pointing outward, and offset.
 
@@ -312,7 +326,8 @@ def search_plane(
     plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
     best = 0.0
     best_rough = 0.0
-    heavy = _heavy(table[WEIGHT])
+    # Later in a frame, bright subsegments with little sampling weight are flanks of fish.
+    heavy = _heavy(table[WEIGHT], intensity_weight if seed == 0 else table[WEIGHT])
     if seed == 0 and laser[heavy[0]] == laser[heavy[heavy.shape[0] - 1]]:
         # A sample needs two lasers. Later in a frame, such subsegments are left over of a surface.
         heavy = np.empty(n, np.int64)

@@ -4,10 +4,6 @@ A peak may lie in the bands of several lasers, and has a candidate for each: wro
 scatter in space, right ones share a plane. Planes are found one after another; peaks that one
 explains are not available to the next, whichever laser they were assigned to. The target is the
 surface to which the posture is measured (`choose_target`).
-
-Cells of the image identify light: one peak yields candidates of several lasers, and one stripe may
-be found by two search directions, so candidates in or next to a cell in which a surface has
-candidates count as the same light.
 """
 
 from collections.abc import Sequence
@@ -16,7 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, U8Array
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import (
     ZERO,
     inline_borrowing_kernel,
@@ -27,7 +23,7 @@ from aqualvs.geometry.compiled import (
 )
 from aqualvs.geometry.linear_algebra import flatnonzero, sum_of
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Subsegments
+from aqualvs.scanning.candidates import Subsegments, mark_cells, number_cells
 from aqualvs.scanning.net_surfaces import (
     describe_pattern,
     is_continuation,
@@ -47,79 +43,6 @@ from aqualvs.scanning.plane_search import (
     search_plane,
     squared_gate,
 )
-
-# Marks of a cell: light in a neighbouring cell, or in the cell itself.
-_BESIDE, _MIDDLE = np.uint8(1), np.uint8(2)
-# Cells have six pixels. Division by six is a multiplication and a shift, exact for integers below
-# 100,000.
-_SIXTH_BITS = 18
-_SIXTH = (1 << _SIXTH_BITS) // 6 + 1
-
-
-@inline_borrowing_kernel
-def _cell(coordinate: float) -> int:
-    """Return the row or column of the cell of a coordinate (px), from 1: cell 0 is a margin."""
-    return (int(max(coordinate, 0.0)) * _SIXTH >> _SIXTH_BITS) + 1
-
-
-@inner_kernel
-def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
-    """Write the number of the cell in which each of N candidates lies.
-
-    Parameters
-    ----------
-    pixels : array, shape (N, 2)
-        In `image`.
-    cell : int array, shape (N,)
-        Written.
-
-    Returns
-    -------
-    n_cells, n_columns : int
-        Cells in total, and in a row; cells are numbered row by row.
-    """
-    right, low = 0.0, 0.0
-    for i in range(pixels.shape[0]):
-        right, low = max(right, pixels[i, 0]), max(low, pixels[i, 1])
-    n_columns = _cell(right) + 2
-    for i in range(pixels.shape[0]):
-        cell[i] = _cell(pixels[i, 1]) * n_columns + _cell(pixels[i, 0])
-    return (_cell(low) + 2) * n_columns, n_columns
-
-
-@inline_borrowing_kernel
-def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
-    """Mark a cell and the eight around it with nonzero values in `lit`, shape (n_cells,)."""
-    if lit[middle] == _MIDDLE:
-        return
-    for row in (middle - n_columns, middle, middle + n_columns):
-        for near in range(row - 1, row + 2):
-            lit[near] = max(lit[near], _BESIDE)
-    lit[middle] = _MIDDLE
-
-
-@inner_kernel
-def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
-    """Mark the cells with explained candidates, and those around them.
-
-    Parameters
-    ----------
-    cell, n_cells, n_columns
-        From `number_cells`.
-    explained : bool array, shape (N,)
-        Candidates that lie on a surface.
-
-    Returns
-    -------
-    uint8 array, shape (n_cells,)
-        Nonzero in marked cells.
-    """
-    lit = np.zeros(n_cells, np.uint8)
-    for i in range(cell.shape[0]):
-        if explained[i]:
-            mark_cells(cell[i], n_columns, lit)
-    return lit
-
 
 MAX_SURFACES = 5
 """Largest number of surfaces in a frame."""
@@ -171,11 +94,90 @@ def search_surfaces(
         Written: search lines, intensity weight and sampling weight of each; those weights of the
         best laser count up to three times those of the second.
     """
-    table, laser = subsegments.table, subsegments.laser
-    intensity_weight = subsegments.intensity_weight
-    free = np.empty(laser.shape[0], np.bool_)
-    for c in range(laser.shape[0]):
+    n_subsegments = subsegments.laser.shape[0]
+    free = np.empty(n_subsegments, np.bool_)
+    for c in range(n_subsegments):
         free[c] = True
+    found = _search_all(
+        subsegments, pixels, n_lasers, nearest, farthest, free, planes, members, sums
+    )
+    if found == 0 or found == MAX_SURFACES:
+        return found
+    plane, mine = planes[found], members[found]
+    return found + _find_before(
+        subsegments, pixels, n_lasers, nearest, farthest, free, planes[0], plane, mine, sums[found]
+    )
+
+
+@inner_kernel
+def _find_before(
+    subsegments: Subsegments,
+    pixels: FloatArray,
+    n_lasers: int,
+    nearest: float,
+    farthest: float,
+    free: BoolArray,
+    behind: FloatArray,
+    plane: FloatArray,
+    members: BoolArray,
+    sums: FloatArray,
+) -> bool:
+    """Find a plane with most of the free light in front of another one, `behind` (4,).
+
+    A coarse net is lit in few places: a small share of the light on the wall behind it.
+    """
+    # The search that ended may have left marks.
+    members[:] = False
+    before, weight = _mark_before(subsegments, behind, free), subsegments.table[WEIGHT]
+    rows = flatnonzero(before)
+    # Numbers of subsegments among which a net is looked for: more are specks.
+    fewest, most = 6, 500
+    if not fewest <= rows.shape[0] <= most:
+        return False
+    if not _find_plane(subsegments, weight, rows, n_lasers, nearest, farthest, ZERO + 1, plane):
+        return False
+    by_laser = np.zeros((3, n_lasers))
+    _collect_inliers(subsegments, rows, plane, members, by_laser)
+    if not _sum_lasers(by_laser, sums):
+        return False
+    cell = np.empty(pixels.shape[0], np.int64)
+    n_cells, n_columns = number_cells(pixels, cell)
+    _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, members, before)
+    left = 0.0
+    for c in range(before.shape[0]):
+        left += weight[c] if before[c] else 0.0
+    return bool(sums[SAMPLING_WEIGHT] > left)
+
+
+@inner_kernel
+def _mark_before(subsegments: Subsegments, plane: FloatArray, free: BoolArray) -> BoolArray:
+    """Mark the free subsegments (C,) in front of a plane (4,)."""
+    table, before = subsegments.table, np.zeros(free.shape[0], np.bool_)
+    # Least distance in front of the plane, as a share of that of the plane.
+    before_share = 0.03
+    for c in range(free.shape[0]):
+        along = plane[0] * table[X, c] + plane[1] * table[Y, c] + plane[2] * table[Z, c]
+        before[c] = free[c] and along < (1.0 - before_share) * plane[3]
+    return before
+
+
+@inner_kernel
+def _search_all(
+    subsegments: Subsegments,
+    pixels: FloatArray,
+    n_lasers: int,
+    nearest: float,
+    farthest: float,
+    free: BoolArray,
+    planes: FloatArray,
+    members: BoolArray,
+    sums: FloatArray,
+) -> int:
+    """Find the planes that have much of the light; return their number.
+
+    `free` (C,) are the subsegments that no plane explains, all at first; other arguments as of
+    `search_surfaces`.
+    """
     cell = np.empty(pixels.shape[0], np.int64)
     n_cells, n_columns = 0, 0
     enough = float(_MIN_LINES)
@@ -183,7 +185,7 @@ def search_surfaces(
     # Least intensity weight, as a share of that of all candidates; planes through noise have up to
     # 0.01.
     min_share = 0.03
-    weight, found, again = table[WEIGHT], ZERO, False
+    weight, found, again = subsegments.table[WEIGHT], ZERO, False
     while found < MAX_SURFACES:
         rows, left = flatnonzero(free), 0
         for k in range(rows.shape[0]):
@@ -192,17 +194,17 @@ def search_surfaces(
             return found
         plane, mine = planes[found], members[found]
         by_laser, n = np.zeros((3, n_lasers)), 0
-        if _find_plane(table, weight, laser, rows, n_lasers, nearest, farthest, found, plane):
+        if _find_plane(subsegments, weight, rows, n_lasers, nearest, farthest, found, plane):
             n = _collect_inliers(subsegments, rows, plane, mine, by_laser)
         is_plane = _sum_lasers(by_laser, sums[found]) and n >= min_subsegments
         light = sum_of(by_laser[INLIER_WEIGHT])
-        if not is_plane or light < min_share * sum_of(intensity_weight):
+        if not is_plane or light < min_share * sum_of(subsegments.intensity_weight):
             if found > 0 or again:
                 return found
             # The sampling weights of long stripes are limited, too much between many specks: of
             # caustics, of a camera that sharpens, or of another laser on thin twine. Search again
             # by intensity weight, but only for a surface that stands out.
-            again, weight = True, intensity_weight
+            again, weight = True, subsegments.intensity_weight
             min_share = _CLEAR_SHARE if is_plane else _MAIN_SHARE
             mine[:] = False
             continue
@@ -216,9 +218,8 @@ def search_surfaces(
 
 @inner_kernel
 def _find_plane(
-    table: FloatArray,
+    subsegments: Subsegments,
     weight: FloatArray,
-    laser: IntArray,
     rows: IntArray,
     n_lasers: int,
     nearest: float,
@@ -227,19 +228,21 @@ def _find_plane(
     plane: FloatArray,
 ) -> bool:
     """Search a plane among the subsegments of some rows, with these weights (C,)."""
+    table, laser = subsegments.table, subsegments.laser
     n = rows.shape[0]
-    some, its_laser = np.empty((N_ROWS, n)), np.empty(n, np.int64)
+    some, intensity_weight = np.empty((N_ROWS, n)), np.empty(n)
+    its_laser = np.empty(n, np.int64)
     start = np.zeros(n_lasers + 1, np.int64)
     for k in range(n):
         c = rows[k]
         for j in range(WEIGHT):
             some[j, k] = table[j, c]
-        some[WEIGHT, k] = weight[c]
+        some[WEIGHT, k], intensity_weight[k] = weight[c], subsegments.intensity_weight[c]
         its_laser[k] = laser[c]
         start[laser[c] + 1] += 1
     for i in range(n_lasers):
         start[i + 1] += start[i]
-    return search_plane(some, its_laser, start, nearest, farthest, seed, plane)
+    return search_plane(some, intensity_weight, its_laser, start, nearest, farthest, seed, plane)
 
 
 @inner_borrowing_kernel
@@ -507,18 +510,18 @@ def _describe(
     """Make a surface from a plane (4,), its subsegments and their sums."""
     lines, inlier_weight, sampling_weight = sums.tolist()
     pattern = describe_pattern(subsegments, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
-    # Least share of a net's light on strands; a fish has more in long or bent components.
-    strands_share = 0.4
     light = np.zeros(n_lasers)
     np.add.at(light, subsegments.laser[members], subsegments.intensity_weight[members])
-    brightest = light.argmax()
-    if pattern.is_mesh and pattern.on_strands[brightest] == 0.0:
-        # This laser lights a strand along its sheet.
+    # Least share of a net's light on strands; a fish has more in long or bent components. Where
+    # each laser lights many strands, long components lie along others, and so do whole stripes.
+    least, many, share_of_many = 0.4, 6, 0.2
+    brightest, along = light.argmax(), pattern.on_strands <= 0.1 * light
+    if pattern.is_mesh and pattern.n_strands >= many * n_lasers:
+        light[along], least = 0.0, share_of_many
+    elif pattern.is_mesh and pattern.on_strands[brightest] == 0.0:
         light[brightest] = 0.0
     # Near the vehicle, strands are long in search lines, and limited in sampling weight.
-    on_strands = max(
-        sampling_weight, limited_sum(pattern.on_strands)
-    ) > strands_share * limited_sum(light)
+    on_strands = max(sampling_weight, limited_sum(pattern.on_strands)) > least * limited_sum(light)
     return Surface(
         plane=Plane(plane[:3], float(plane[3])),
         members=members,

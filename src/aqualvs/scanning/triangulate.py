@@ -46,7 +46,8 @@ class Triangulator:
 
     def __init__(self, rig: Rig, camera: Camera) -> None:
         self._camera = camera
-        self._planes, self._bent = planes_and_bent(packed_sheets(rig, camera))
+        # Shape (n_lasers, 4): normals and offsets in `dome`; the middles of bent sheets.
+        self.planes, self._bent = planes_and_bent(packed_sheets(rig, camera))
 
     def triangulate(
         self, pixels: FloatArray, along_x: IntArray, laser: IntArray, group: IntArray | None = None
@@ -93,7 +94,7 @@ class Triangulator:
         seen = np.empty(n_rays, np.bool_)
         rays_all(self._camera.params, rays_px[:n_rays], origins, directions, seen)
         all_valid: bool = _intersect(
-            self._planes,
+            self.planes,
             self._bent,
             laser,
             owner,

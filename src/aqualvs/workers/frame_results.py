@@ -268,10 +268,12 @@ class FrameProcessor:
         # Step by step for all frames: code that has just run is still in the caches, from which
         # decoding and the other step would displace it.
         peaks = [scanner.detect(frame) for frame in frames]
-        return [
-            (scanner.measure(frame.index, frame.time_s, found), ScanInputs(scanner.rig, found))
-            for frame, found in zip(frames, peaks, strict=True)
-        ]
+        scans: list[tuple[Scan, ScanInputs | None]] = []
+        for frame, found in zip(frames, peaks, strict=True):
+            scan = scanner.measure(frame.index, frame.time_s, found)
+            found, scan = scanner.without_colour(frame, found, scan)
+            scans.append((scan, ScanInputs(scanner.rig, found)))
+        return scans
 
 
 def corrected_rows(

@@ -122,8 +122,11 @@ class Replay(Closing):
             scan = Scan(frame.index, frame.time_s, recorded.refusal, nothing, recorded.n_water)
             return scan, ScanInputs(self.rig, {})
         scanner = self._scanner_in(recorded.n_water)
-        peaks = scanner.detect(frame) if self._detects else recorded.peaks
-        scan = scanner.measure(frame.index, frame.time_s, peaks)
+        if self._detects:
+            peaks, scan = scanner.scan(frame)
+        else:
+            peaks = recorded.peaks
+            scan = scanner.measure(frame.index, frame.time_s, peaks)
         return replace(scan, turning=recorded.turning), ScanInputs(scanner.rig, peaks)
 
     def _scanner_in(self, n_water: float) -> Scanner:
@@ -354,8 +357,8 @@ class WaterFollowingScanner:
         """Measure a frame, and return the rig and the stripes that it was measured with."""
         if self.is_due(frame):
             self.look(frame)
-        scanner, peaks = self.scanner, self.scanner.detect(frame)
-        return scanner.measure(frame.index, frame.time_s, peaks), ScanInputs(scanner.rig, peaks)
+        peaks, scan = self.scanner.scan(frame)
+        return scan, ScanInputs(self.scanner.rig, peaks)
 
     @property
     def sigma_n_water(self) -> float:
