@@ -260,28 +260,32 @@ def _median_weight(sampling_weight: FloatArray) -> float:
 
 
 @inner_kernel
-def _heavy(sampling_weight: FloatArray, intensity_weight: FloatArray) -> IntArray:
+def _heavy(sampling_weight: FloatArray) -> IntArray:
     """Return the subsegments to sample: those not much below the weighted median.
 
-    Where glare makes thousands of specks, most neighbours on a stripe would be specks. All are
-    sampled if the others have most of the intensity weight: on a wall in caustics, the sampling
-    weight of long stripes is limited to less than that of specks.
+    Where glare makes thousands of specks, most neighbours on a stripe would be specks.
     """
     least = _LIGHTEST_SHARE * _median_weight(sampling_weight)
     heavy, n = np.empty(sampling_weight.shape[0], np.int64), 0
-    of_others = 0.0
     for c in range(sampling_weight.shape[0]):
         if sampling_weight[c] >= least:
             heavy[n] = c
             n += 1
-        else:
-            of_others += intensity_weight[c]
-    most = 0.6  # Least share of the intensity weight.
-    if of_others < most * sum_of(intensity_weight):
-        return heavy[:n]
-    for c in range(sampling_weight.shape[0]):
-        heavy[c] = c
-    return heavy
+    return heavy[:n]
+
+
+@inner_kernel
+def _are_enough(heavy: IntArray, laser: IntArray, intensity_weight: FloatArray) -> bool:
+    """Return whether the heavy subsegments show two lasers, and enough of the light.
+
+    A sample needs two lasers. On a wall in caustics, the sampling weight of long stripes is limited
+    to less than that of specks.
+    """
+    enough = 0.4  # Least share of the intensity weight.
+    of_two = laser[heavy[0]] != laser[heavy[heavy.shape[0] - 1]]
+    return bool(
+        of_two and sum_of(take(intensity_weight, heavy)) > enough * sum_of(intensity_weight)
+    )
 
 
 @inner_kernel
@@ -326,10 +330,9 @@ def search_plane(
     plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
     best = 0.0
     best_rough = 0.0
-    # Later in a frame, bright subsegments with little sampling weight are flanks of fish.
-    heavy = _heavy(table[WEIGHT], intensity_weight if seed == 0 else table[WEIGHT])
-    if seed == 0 and laser[heavy[0]] == laser[heavy[heavy.shape[0] - 1]]:
-        # A sample needs two lasers. Later in a frame, such subsegments are left over of a surface.
+    heavy = _heavy(table[WEIGHT])
+    if seed == 0 and not _are_enough(heavy, laser, intensity_weight):
+        # Later in a frame, the others are left over of a surface, or flanks of fish.
         heavy = np.empty(n, np.int64)
         for c in range(n):
             heavy[c] = c
