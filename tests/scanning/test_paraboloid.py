@@ -96,6 +96,17 @@ def test_a_plane_is_left_a_plane() -> None:
     assert not found.is_clear
 
 
+def test_a_strand_along_a_stripe_is_no_twist() -> None:
+    flat = observed(patch_of(*np.zeros(6)), n=12)
+    # The diagonal laser lights pieces of one strand, more and more off the middle of its sheet.
+    seen = Observations(*(one[(flat.laser != 2) | (flat.line > 300.0)] for one in flat))
+    off_px = np.linspace(0.4, 2.0, 7)
+    seen.points[-7:] += off_px[:, None] * seen.sensitivity[-7:]
+    found = fit_patch(seen, BASE, shared(seen))
+    assert found is not None
+    assert not found.is_clear
+
+
 @pytest.mark.parametrize("bend", [0.0, 0.2])
 def test_a_bend_is_hinted_at(bend: float) -> None:
     seen = observed(patch_of(0.0, 0.0, 0.0, bend, 0.0, 0.0), noise_px=0.02)

@@ -134,8 +134,9 @@ def _is_clear(
             n_inside += 1
     if highest - lowest < min_bend:
         return False
+    # Nets bulge; a strand along a diagonal stripe, off the middle of its sheet, looks like a twist.
     sigmas = 0.0
-    for k in range(3, N):
+    for k in (3, 5):
         sigmas = max(sigmas, abs(coefficients[k]) / np.sqrt(covariance[k, k]))
     significant = 6.0  # In standard deviations.
     if sigmas < significant:
