@@ -9,6 +9,7 @@ surface to which the posture is measured (`choose_target`).
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,29 +64,25 @@ LINES, INLIER_WEIGHT, SAMPLING_WEIGHT = range(3)
 """Sums over a surface: search lines on it, intensity weight, and sampling weight."""
 
 
+class SurfaceSearch(NamedTuple):
+    """The light of a frame, and limits of the planes that are searched in it."""
+
+    subsegments: Subsegments  # C of them.
+    pixels: FloatArray  # Shape (N, 2): each candidate's place in the image.
+    n_lasers: int  # Lasers of the rig.
+    nearest: float  # Limits of the planes' offsets, in metres.
+    farthest: float
+
+
 @lazy_kernel
 def search_surfaces(
-    subsegments: Subsegments,
-    pixels: FloatArray,
-    n_lasers: int,
-    nearest: float,
-    farthest: float,
-    planes: FloatArray,
-    members: BoolArray,
-    sums: FloatArray,
+    search: SurfaceSearch, planes: FloatArray, members: BoolArray, sums: FloatArray
 ) -> int:
     """Find planes that two lasers agree on, best supported first; return their number.
 
     Parameters
     ----------
-    subsegments : Subsegments
-        C of them.
-    pixels : array, shape (N, 2)
-        Each candidate's place in the image.
-    n_lasers : int
-        Lasers of the rig.
-    nearest, farthest : float
-        Limits of the hypotheses, in metres.
+    search : SurfaceSearch
     planes : array, shape (5, 4)
         Written: normals and offsets.
     members : bool array, shape (5, C)
@@ -94,28 +91,20 @@ def search_surfaces(
         Written: search lines, intensity weight and sampling weight of each; those weights of the
         best laser count up to three times those of the second.
     """
-    n_subsegments = subsegments.laser.shape[0]
+    n_subsegments = search.subsegments.laser.shape[0]
     free = np.empty(n_subsegments, np.bool_)
     for c in range(n_subsegments):
         free[c] = True
-    found = _search_all(
-        subsegments, pixels, n_lasers, nearest, farthest, free, planes, members, sums
-    )
+    found = _search_all(search, free, planes, members, sums)
     if found == 0 or found == MAX_SURFACES:
         return found
     plane, mine = planes[found], members[found]
-    return found + _find_before(
-        subsegments, pixels, n_lasers, nearest, farthest, free, planes[0], plane, mine, sums[found]
-    )
+    return found + _find_before(search, free, planes[0], plane, mine, sums[found])
 
 
 @inner_kernel
 def _find_before(
-    subsegments: Subsegments,
-    pixels: FloatArray,
-    n_lasers: int,
-    nearest: float,
-    farthest: float,
+    search: SurfaceSearch,
     free: BoolArray,
     behind: FloatArray,
     plane: FloatArray,
@@ -126,6 +115,7 @@ def _find_before(
 
     A coarse net is lit in few places: a small share of the light on the wall behind it.
     """
+    subsegments = search.subsegments
     # The search that ended may have left marks.
     members[:] = False
     before, weight = _mark_before(subsegments, behind, free), subsegments.table[WEIGHT]
@@ -134,14 +124,14 @@ def _find_before(
     fewest, most = 6, 500
     if not fewest <= rows.shape[0] <= most:
         return False
-    if not _find_plane(subsegments, weight, rows, n_lasers, nearest, farthest, ZERO + 1, plane):
+    if not _find_plane(search, weight, rows, ZERO + 1, plane):
         return False
-    by_laser = np.zeros((3, n_lasers))
+    by_laser = np.zeros((3, search.n_lasers))
     _collect_inliers(subsegments, rows, plane, members, by_laser)
     if not _sum_lasers(by_laser, sums):
         return False
-    cell = np.empty(pixels.shape[0], np.int64)
-    n_cells, n_columns = number_cells(pixels, cell)
+    cell = np.empty(search.pixels.shape[0], np.int64)
+    n_cells, n_columns = number_cells(search.pixels, cell)
     _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, members, before)
     left = 0.0
     for c in range(before.shape[0]):
@@ -163,22 +153,15 @@ def _mark_before(subsegments: Subsegments, plane: FloatArray, free: BoolArray) -
 
 @inner_kernel
 def _search_all(
-    subsegments: Subsegments,
-    pixels: FloatArray,
-    n_lasers: int,
-    nearest: float,
-    farthest: float,
-    free: BoolArray,
-    planes: FloatArray,
-    members: BoolArray,
-    sums: FloatArray,
+    search: SurfaceSearch, free: BoolArray, planes: FloatArray, members: BoolArray, sums: FloatArray
 ) -> int:
     """Find the planes that have much of the light; return their number.
 
     `free` (C,) are the subsegments that no plane explains, all at first; other arguments as of
     `search_surfaces`.
     """
-    cell = np.empty(pixels.shape[0], np.int64)
+    subsegments = search.subsegments
+    cell = np.empty(search.pixels.shape[0], np.int64)
     n_cells, n_columns = 0, 0
     enough = float(_MIN_LINES)
     min_subsegments = 6
@@ -193,8 +176,8 @@ def _search_all(
         if left < enough or rows.shape[0] < min_subsegments:
             return found
         plane, mine = planes[found], members[found]
-        by_laser, n = np.zeros((3, n_lasers)), 0
-        if _find_plane(subsegments, weight, rows, n_lasers, nearest, farthest, found, plane):
+        by_laser, n = np.zeros((3, search.n_lasers)), 0
+        if _find_plane(search, weight, rows, found, plane):
             n = _collect_inliers(subsegments, rows, plane, mine, by_laser)
         is_plane = _sum_lasers(by_laser, sums[found]) and n >= min_subsegments
         light = sum_of(by_laser[INLIER_WEIGHT])
@@ -210,7 +193,7 @@ def _search_all(
             continue
         enough = max(enough, WORTH_SHARE * sums[found, LINES])
         if n_cells == 0:
-            n_cells, n_columns = number_cells(pixels, cell)
+            n_cells, n_columns = number_cells(search.pixels, cell)
         _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, mine, free)
         found += 1
     return MAX_SURFACES
@@ -218,16 +201,10 @@ def _search_all(
 
 @inner_kernel
 def _find_plane(
-    subsegments: Subsegments,
-    weight: FloatArray,
-    rows: IntArray,
-    n_lasers: int,
-    nearest: float,
-    farthest: float,
-    seed: int,
-    plane: FloatArray,
+    search: SurfaceSearch, weight: FloatArray, rows: IntArray, seed: int, plane: FloatArray
 ) -> bool:
     """Search a plane among the subsegments of some rows, with these weights (C,)."""
+    subsegments, n_lasers = search.subsegments, search.n_lasers
     table, laser = subsegments.table, subsegments.laser
     n = rows.shape[0]
     some, intensity_weight = np.empty((N_ROWS, n)), np.empty(n)
@@ -242,7 +219,8 @@ def _find_plane(
         start[laser[c] + 1] += 1
     for i in range(n_lasers):
         start[i + 1] += start[i]
-    return search_plane(some, intensity_weight, its_laser, start, nearest, farthest, seed, plane)
+    limits = search.nearest, search.farthest
+    return search_plane(some, intensity_weight, its_laser, start, *limits, seed, plane)
 
 
 @inner_borrowing_kernel
@@ -330,7 +308,7 @@ def collect_left_over(
     Parameters
     ----------
     subsegments, pixels, n_lasers
-        As in `search_surfaces`.
+        As in `SurfaceSearch`.
     others : bool array, shape (C,)
         Subsegments on the other surface.
     members : bool array, shape (C,)
@@ -440,7 +418,8 @@ def find_surfaces(
     """
     planes, sums = np.empty((MAX_SURFACES, 4)), np.empty((MAX_SURFACES, 3))
     members = np.zeros((MAX_SURFACES, subsegments.n), np.bool_)
-    n = search_surfaces(subsegments, pixels, n_lasers, *working_range, planes, members, sums)
+    search = SurfaceSearch(subsegments, pixels, n_lasers, *working_range)
+    n = search_surfaces(search, planes, members, sums)
     surfaces = [
         _describe(subsegments, planes[i], members[i], sums[i], n_lasers, focal_px) for i in range(n)
     ]
