@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 import pytest
 
@@ -157,6 +158,24 @@ def test_lines_whose_colour_is_lost_are_measured_by_luma() -> None:
     # With one of the lasers dark, colour would have to tell.
     two = frame_of(light_on(scanner.rig, [(wall, everywhere)], (0, 1)), noise=2.0)
     assert not scanner.process(replace(two, chroma=(u, v))).posture
+
+
+@pytest.mark.parametrize("grey", [False, True])
+def test_dashes_without_colour_on_a_net_in_daylight_are_the_tallest_peaks(grey: bool) -> None:
+    net, scanner = plane(0.75, 3.0, -5.0), Scanner(example_rig())
+    dashes = light_on(scanner.rig, [(net, strands)], ALL)
+    points, _ = net.intersect(rays_of(scanner.rig.size_px))
+    twine = cv2.GaussianBlur(45.0 * strands(points), (0, 0), 1.0)
+    frame = frame_of(dashes + twine, grey=True, noise=2.0)
+    if not grey:
+        # Too green for a grey camera, and as green everywhere.
+        u, v = (np.full((288, 360), level, np.uint8) for level in (119, 117))
+        frame = replace(frame, chroma=(u, v))
+    assert not scanner.measure(frame.index, frame.time_s, scanner.detect(frame)).posture
+    assert_posture(scanner.process(frame).posture, net)
+    # With the lasers off, nothing is certain.
+    off = frame_of(twine, grey=True, noise=2.0)
+    assert not scanner.process(replace(off, chroma=frame.chroma)).posture
 
 
 @pytest.mark.parametrize(

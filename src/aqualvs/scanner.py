@@ -198,10 +198,11 @@ class Scanner:
     def without_colour(
         self, frame: Frame, peaks: dict[SearchAxis, StripePeaks], scan: Scan
     ) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
-        """Measure a frame once more by luma if its colours leave hardly a stripe.
+        """Measure a frame once more from its tallest peaks if its colours leave hardly a stripe.
 
         Codecs drop the chroma of short dashes, and in turbid water the glow beside a line is as
-        green as the line.
+        green as the line; lamps and daylight make more peaks on twine than the lasers, but lower
+        ones.
 
         Parameters
         ----------
@@ -214,16 +215,23 @@ class Scanner:
         Returns
         -------
         peaks, scan
-            By luma if that gives a posture that is certain without colour; else as given.
+            Of the tallest peaks if they give a posture that is certain without colour; else as
+            given.
         """
-        hardly_any = (Reason.NO_STRIPES, Reason.TOO_FEW_POINTS, Reason.NOT_A_PLANE)
+        hardly_any = (
+            Reason.NO_STRIPES,
+            Reason.TOO_FEW_POINTS,
+            Reason.ONE_LASER,
+            Reason.COLLINEAR,
+            Reason.NOT_A_PLANE,
+        )
         refusal = scan.posture
-        by_colour = frame.chroma is not None and isinstance(self.options.detector, StripeOptions)
-        if not by_colour or refusal or refusal.reason not in hardly_any:
+        finds_stripes = isinstance(self.options.detector, StripeOptions)
+        if not finds_stripes or refusal or refusal.reason not in hardly_any:
             return peaks, scan
-        by_luma = self.detect(replace(frame, chroma=None))
-        again = self.measure(frame.index, frame.time_s, by_luma, has_colour=False)
-        return (by_luma, again) if again.posture else (peaks, scan)
+        tallest = self._search(frame.index).detector.detect_tallest(frame)
+        again = self.measure(frame.index, frame.time_s, tallest, has_colour=False)
+        return (tallest, again) if again.posture else (peaks, scan)
 
     def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
         """Find the sub-pixel peaks along the search lines, within the lasers' bands.

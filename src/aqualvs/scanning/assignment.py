@@ -189,7 +189,7 @@ class AssignmentTest:
             The one to judge.
         """
         share = self._light_share(candidates, subsegments, surfaces, target)
-        visible, faint, dark = self._visibility(target, subsegments)
+        visible, faint, dark, _ = self._visibility(target, subsegments)
         if target.is_mesh and dark > _ODDS.may_be_faint and visible > _ODDS.max_visible_along:
             return share < _ODDS.max_share_along
         # Planes by chance are steep, because there are more steep planes: those that caustics make
@@ -212,7 +212,7 @@ class AssignmentTest:
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
-        """Return whether a surface is there although colour does not tell: all lasers show it.
+        """Return whether a surface is there although colour does not tell: three lasers show it.
 
         Parameters
         ----------
@@ -220,9 +220,9 @@ class AssignmentTest:
             As in `is_by_chance`.
         """
         share = self._light_share(candidates, subsegments, surfaces, target)
-        visible, faint, _ = self._visibility(target, subsegments)
+        visible, _, _, n_even = self._visibility(target, subsegments)
         few, is_bright = 3, share >= _ODDS.certain_share and visible >= _ODDS.small_share
-        return is_bright and faint == 0.0 and _n_lasers_on(target, subsegments) >= few
+        return is_bright and n_even >= few
 
     def overlooked(
         self,
@@ -259,7 +259,7 @@ class AssignmentTest:
             share = self._light_share(candidates, subsegments, surfaces, one)
             # As wide as the target, it may be a net one of whose strands lies along a sheet.
             is_wide = one.extent >= _ODDS.min_extent * target.n_lines
-            visible, faint, _ = self._visibility(one, subsegments, along_strand=is_wide)
+            visible, faint, _, _ = self._visibility(one, subsegments, along_strand=is_wide)
             if _is_small(one, share, visible) or faint > _ODDS.may_be_faint:
                 continue
             is_mesh = one.is_mesh or seen_through(one.members, target.members, subsegments)
@@ -393,14 +393,14 @@ class AssignmentTest:
 
     def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether too many of the lasers that should show a surface are faint on it."""
-        _, faint, _ = self._visibility(surface, subsegments)
+        _, faint, _, _ = self._visibility(surface, subsegments)
         return faint > _ODDS.may_be_faint
 
     def _visibility(
         self, surface: Surface, subsegments: Subsegments, *, along_strand: bool = False
-    ) -> tuple[float, float, float]:
-        """Return visible share of a surface's best stripe; shares of faint and of dark lasers."""
-        found: tuple[float, float, float] = stripe_visibility(
+    ) -> tuple[float, float, float, int]:
+        """Return the `stripe_visibility` of a surface."""
+        found: tuple[float, float, float, int] = stripe_visibility(
             surface.plane.packed(), surface.members, subsegments, self._bands, along_strand
         )
         return found

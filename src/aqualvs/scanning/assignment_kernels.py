@@ -615,11 +615,12 @@ def stripe_visibility(
     subsegments: Subsegments,
     bands: FloatArray,
     along_strand: bool,
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, int]:
     """Return the visible share of a surface's best stripe; shares of faint and of dark lasers.
 
     The visible share of a stripe is the number of its search lines on the surface, over that of the
-    cells in which the stripe lies in the picture. Lasers in few cells are not judged.
+    cells in which the stripe lies in the picture. Lasers in few cells are not judged. The last
+    number is that of the lasers that are judged and not faint.
 
     Parameters
     ----------
@@ -654,7 +655,7 @@ def stripe_visibility(
             asked += 1
             faint += visible[i] < _LIGHT.faint * (second if along_strand else most)
             dark += visible[i] == 0.0
-    return most, faint / max(asked, 1), dark / max(asked, 1)
+    return most, faint / max(asked, 1), dark / max(asked, 1), asked - faint
 
 
 @inner_borrowing_kernel

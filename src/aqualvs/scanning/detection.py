@@ -5,6 +5,7 @@ peaks in them within the lasers' bands.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -159,6 +160,9 @@ class _SampleOptions(NamedTuple):
     cache_line: int = 8
     # Largest width of an overexposed line, as a share of the picture's width.
     widest_white: float = 0.02
+    # Largest number of the tallest peaks, as a share of what the lasers can make: nets are lit on
+    # less than a quarter of the search lines, walls on most.
+    tallest: float = 0.6
 
 
 _SAMPLE = _SampleOptions()
@@ -332,6 +336,27 @@ class FrameDetector:
         if self._field and SearchAxis.ALONG_Y in found:
             found[SearchAxis.ALONG_Y] = _in_picture(found[SearchAxis.ALONG_Y], self._field)
         return found
+
+    def detect_tallest(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
+        """Find the tallest peaks by luma alone, fewer than the lasers can make.
+
+        Lamps and daylight make many more peaks on twine, but lower ones than the lasers.
+
+        Parameters
+        ----------
+        frame, and what is returned and raised
+            As in `detect`.
+        """
+        found = self.detect(replace(frame, chroma=None))
+        most = int(_SAMPLE.tallest * self._n_possible)
+        heights = np.concatenate([np.empty(0), *(peaks.height for peaks in found.values())])
+        if most >= len(heights):
+            return found
+        least = np.partition(heights, -most)[-most]
+        return {
+            axis: StripePeaks(*(column[peaks.height >= least] for column in peaks))
+            for axis, peaks in found.items()
+        }
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, StripePeaks]:
         frame = without_neutral_chroma(frame)
