@@ -429,7 +429,12 @@ class Scanner:
             )
             return Refusal(Reason.AMBIGUOUS, detail)
         others = assignment.other_lines(
-            candidates, subsegments, stripes.shapes, choice.surfaces, target
+            candidates,
+            subsegments,
+            stripes.shapes,
+            choice.surfaces,
+            target,
+            has_colour=stripes.has_colour,
         )
         if others is not None:
             detail = (

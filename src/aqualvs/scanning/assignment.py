@@ -84,12 +84,17 @@ class _AssignmentOptions(NamedTuple):
     # Least extent of the gappy stripes of a net that may hang in front of all of a solid target, as
     # a share of the target's search lines: fish have 0.5 at most.
     min_extent: float = 0.6
+    # With more light than this as well, it need not show all lasers: a coarse net has few strands.
+    wide_share: float = 0.2
     # Least visible share of the best stripe of a surface with so little light: 0.12 to 0.25 on
     # nets, 0.05 to 0.09 where strands in daylight make a plane by chance.
     min_visible: float = 0.1
     # Least share of the light of a surface if colour is no evidence: nets whose dashes lost their
     # chroma have 0.18 to 0.26.
     certain_share: float = 0.15
+    # Least visible share of the best stripe of something solid without colour: walls have 0.66 and
+    # more, a plane through peaks of a net and of what is behind it had 0.17.
+    certain_of_solid: float = 0.4
     # With less light than this, a surface is there by chance whatever else it shows: specks of a
     # fouled net that made a plane at a third of its range had 0.05, 1,100 nets and walls in
     # rendered dives 0.075 and more.
@@ -212,17 +217,22 @@ class AssignmentTest:
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
-        """Return whether a surface is there although colour does not tell: three lasers show it.
+        """Return whether a surface is there although colour does not tell.
+
+        Three lasers show it evenly, and no net is in front: a wall's tallest peaks look like one.
 
         Parameters
         ----------
         candidates, subsegments, surfaces, target
             As in `is_by_chance`.
         """
+        others = [one for one in surfaces if one is not target and one.is_mesh]
+        if any(_is_nearer(one, target, subsegments) for one in others):
+            return False
         share = self._light_share(candidates, subsegments, surfaces, target)
         visible, _, _, n_even = self._visibility(target, subsegments)
-        few, is_bright = 3, share >= _ODDS.certain_share and visible >= _ODDS.small_share
-        return is_bright and n_even >= few
+        few, least = 3, _ODDS.small_share if target.is_mesh else _ODDS.certain_of_solid
+        return share >= _ODDS.certain_share and visible >= least and n_even >= few
 
     def overlooked(
         self,
@@ -260,7 +270,8 @@ class AssignmentTest:
             # As wide as the target, it may be a net one of whose strands lies along a sheet.
             is_wide = one.extent >= _ODDS.min_extent * target.n_lines
             visible, faint, _, _ = self._visibility(one, subsegments, along_strand=is_wide)
-            if _is_small(one, share, visible) or faint > _ODDS.may_be_faint:
+            is_uneven = faint > _ODDS.may_be_faint and not (is_wide and share > _ODDS.wide_share)
+            if _is_small(one, share, visible) or is_uneven:
                 continue
             is_mesh = one.is_mesh or seen_through(one.members, target.members, subsegments)
             return replace(one, is_mesh=is_mesh)
@@ -310,6 +321,8 @@ class AssignmentTest:
         shapes: ComponentShapes,
         surfaces: Sequence[Surface],
         target: Surface,
+        *,
+        has_colour: bool,
     ) -> float | None:
         """Return the light in other lines beside a target's stripes, if it is too much.
 
@@ -320,6 +333,8 @@ class AssignmentTest:
         candidates, subsegments, shapes, surfaces, target
             As in `may_hide_net`. A solid surface behind a net that shows as many lasers is no other
             line.
+        has_colour : bool
+            If false, there may be less such light before a net.
 
         Returns
         -------
@@ -339,7 +354,8 @@ class AssignmentTest:
         share: float = other_lines_share(
             candidates, subsegments.of_candidate, target.members, behind, shapes, n_lasers
         )
-        most = _ODDS.max_other_lines_of_net if target.is_mesh else _ODDS.max_other_lines
+        of_net = target.is_mesh and has_colour
+        most = _ODDS.max_other_lines_of_net if of_net else _ODDS.max_other_lines
         return share if share > most else None
 
     def may_be_exchanged(self, subsegments: Subsegments, target: Surface) -> bool:

@@ -388,8 +388,10 @@ def _describe(
             n_strands += n
         total += extent if is_gappy else 0.0
     few = not long and gappy == broken and n_intervals >= _FEW_INTERVALS
+    # Of many lasers, two broken stripes among unbroken ones are no net.
     enough = min(2, asked)
-    is_mesh, is_gappy = broken >= enough or few, gappy >= enough or few
+    is_mesh = (broken >= enough and broken >= unbroken) or few
+    is_gappy = gappy >= enough or few
     return is_mesh, is_gappy, unbroken >= enough, n_strands, total
 
 

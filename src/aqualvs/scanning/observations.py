@@ -214,15 +214,19 @@ def _mean_widths(
 ) -> FloatArray:
     """Return each laser's mean stripe width in pixels, -1 without a stripe.
 
-    Means, because a crossing inflates the widths of the peaks in it.
+    Means, because a crossing inflates the widths of the peaks in it. A few stray peaks of a dark
+    laser, often wide, are no stripe: their crossing with another one could cover all of it.
     """
+    # Least number of peaks of a stripe, as a share of that of the longest.
+    stray_share = 0.05
     total, count = np.zeros(n_lasers), np.zeros(n_lasers)
     for i in range(unit.shape[0]):
         if number[unit[i]] != -1:
             total[laser[i]] += width[i]
             count[laser[i]] += 1.0
+    least = stray_share * count.max()
     for index in range(n_lasers):
-        total[index] = total[index] / count[index] if count[index] > 0.0 else -1.0
+        total[index] = total[index] / count[index] if count[index] > least else -1.0
     return total
 
 
