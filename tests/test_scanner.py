@@ -20,7 +20,7 @@ from aqualvs.scanning.plane_fit import GLOW_SHARE, TWINE_SHARE
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
-from aqualvs.scanning.stripe import ThresholdOptions, flank_difference
+from aqualvs.scanning.stripe import StripePeaks, ThresholdOptions, flank_difference
 from aqualvs.scanning.surfaces import Surface, TargetKind, find_surfaces
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import peaks_of
@@ -301,6 +301,24 @@ def test_one_laser_on(laser: int) -> None:
     assert reason(found.posture) in {Reason.ONE_LASER, Reason.NOT_A_PLANE}
 
 
+def test_stray_peaks_of_a_dark_laser_cross_no_stripe() -> None:
+    """They may be wide: the crossing of a stripe so wide would cover the others."""
+    rig, wall = example_rig(), plane(0.5, 4.0)
+    first, dark, last = rig.lasers
+
+    def spot(points: FloatArray) -> BoolArray:
+        return np.abs(points @ np.array([1.0, 0.0, 1.0]) - 0.1) < 0.003
+
+    peaks = peaks_of(replace(rig, lasers=(first, last)), [(wall, everywhere)], 0.05)
+    for axis, stray in peaks_of(replace(rig, lasers=(dark,)), [(wall, spot)]).items():
+        assert 3 <= stray.n < 20, stray.n
+        wide = stray._replace(width=np.full(stray.n, 400.0))
+        joined = [np.concatenate(columns) for columns in zip(peaks[axis], wide, strict=True)]
+        order = np.lexsort((joined[1], joined[0]))
+        peaks[axis] = StripePeaks(*(column[order] for column in joined))
+    assert_posture(Scanner(rig).measure(0, 0.0, peaks).posture, wall)
+
+
 def test_a_rig_of_one_laser() -> None:
     rig = example_rig()
     found = scan([(plane(0.5), everywhere)], rig=replace(rig, lasers=rig.lasers[:1]), lasers=(0,))
@@ -434,27 +452,33 @@ def test_the_paper_s_mesh_filter_takes_a_wall_away_and_leaves_a_net(rig: Rig) ->
     assert np.median(kept) > 60
 
 
-@pytest.mark.parametrize("is_unbroken", [True, False])
+def patch(points: FloatArray) -> BoolArray:
+    """As much of a wall as the flank of a fish."""
+    flank: BoolArray = np.hypot(points[..., 0], points[..., 2]) < 0.05
+    return flank
+
+
+@pytest.mark.parametrize("lit", [everywhere, patch])
 def test_a_wall_whose_lines_look_broken_is_measured_as_one(
-    is_unbroken: bool, monkeypatch: pytest.MonkeyPatch
+    lit: Lit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Noise breaks dim lines like twine; too few strands are left for a net's posture."""
 
     def broken_surfaces(*arguments: Any) -> list[Surface]:
         found = find_surfaces(*arguments)
-        return [replace(one, is_mesh=True, is_unbroken=is_unbroken) for one in found]
+        return [replace(one, is_mesh=True, is_unbroken=True) for one in found]
 
     monkeypatch.setattr("aqualvs.scanner.find_surfaces", broken_surfaces)
     rig = example_rig()
-    peaks = peaks_of(rig, [(plane(0.6, 4.0), everywhere)], 0.05)
+    peaks = peaks_of(rig, [(plane(0.6, 4.0), lit)], 0.05)
     scan = Scanner(rig).measure(0, 0.0, peaks)
-    if is_unbroken:
+    if lit is everywhere:
         assert isinstance(scan.posture, Posture)
         assert scan.posture.range == pytest.approx(0.6, rel=1e-3)
         assert np.mean(scan.points.label == Label.SOLID) > 0.9
     else:
         assert isinstance(scan.posture, Refusal)
-        assert scan.posture.reason is Reason.COLLINEAR
+        assert scan.posture.reason in {Reason.COLLINEAR, Reason.TOO_FEW_POINTS, Reason.ONE_LASER}
     # Who asks for a net gets none.
     wanted = Scanner(rig, ScannerOptions(target=TargetKind.NET)).measure(0, 0.0, peaks)
     assert not wanted.posture

@@ -332,12 +332,13 @@ class Scanner:
         stripes = _Stripes(candidates, subsegments, shapes, assignment, has_colour)
         choice = self._choose_target(stripes, surfaces)
         measurement = self._measure_target(stripes, choice)
-        other = _as_other_kind(choice.target, measurement, self.rig.focal_px)
+        other = _as_other_kind(stripes, choice.target, measurement, self.rig.focal_px)
         if self.options.target is TargetKind.AUTO and other is not None:
             surfaces = _with_replaced(choice.surfaces, other)
             changed = choice._replace(surfaces=surfaces, target=other)
             again = self._measure_target(stripes, changed)
-            if again.posture or not measurement.posture:
+            # A rough wall is no net in folds.
+            if not measurement.posture or (again.posture and not again.folded):
                 choice, measurement = changed, again
         # The kind of surface that every point lies on.
         points, rows = label_candidates(
@@ -516,21 +517,21 @@ def _with_replaced(surfaces: list[Surface], changed: Surface) -> list[Surface]:
 
 
 def _as_other_kind(
-    target: Surface | None, measurement: Measurement, focal_px: float
+    stripes: _Stripes, target: Surface | None, measurement: Measurement, focal_px: float
 ) -> Surface | None:
     """Return a target as solid, or as a net, if it is likely to be that.
 
-    Noise breaks the lines of a dim picture as twine does: a net whose strands are too few for a
-    posture is solid if its lines are a wall's. Growth fills the gaps of a net: what has small gaps
-    only, but no long lines either, and is rough, is a net.
+    Noise and codecs break the lines of a dim picture as twine does: a net whose strands are too few
+    for a posture is solid if it is lit on much of its lines. Growth fills the gaps of a net: what
+    has small gaps only, but no long lines either, and is rough, is a net.
     """
     if target is None:
         return None
     too_little = (Reason.ONE_LASER, Reason.COLLINEAR, Reason.TOO_FEW_POINTS)
     posture = measurement.posture
     if target.is_mesh and isinstance(posture, Refusal) and posture.reason in too_little:
-        (solid,) = as_requested_kind([target], TargetKind.SOLID)
-        return None if solid.is_mesh else solid
+        is_solid = stripes.assignment.fills_lines(stripes.subsegments, target)
+        return replace(target, is_mesh=False) if is_solid else None
     # Points scatter about walls by 0.15 to 0.5 px, in strong sun by 0.8, about grown nets that pass
     # as solid by 0.5 to 1.6.
     rough_px = 0.7

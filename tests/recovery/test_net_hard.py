@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from benchmarks.random_nets import shots
 from scipy.spatial import cKDTree
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
@@ -282,3 +283,11 @@ def test_a_laser_along_a_strand_makes_no_wall_of_a_net(slide: tuple[float, float
     # The strand alone is much of the light.
     assert np.ptp(scan.points.pixels[scan.points.laser == 0, 0]) > 600
     assert np.mean(scan.points.label == Label.SOLID) < 0.05
+
+
+@pytest.mark.parametrize("number", [7024, 41003, 41087])
+def test_what_is_behind_a_coarse_net_is_not_its_posture(number: int) -> None:
+    """The wall has ten times the light of the few lit strands, and looks like a net in shadows."""
+    (shot,) = shots(1, number, None)
+    posture = equipment()[1].process(shot.frame).posture
+    assert not posture or abs(posture.range / shot.plane[3] - 1.0) < 0.005

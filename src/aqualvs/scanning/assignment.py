@@ -81,8 +81,8 @@ class _AssignmentOptions(NamedTuple):
     small_share: float = 0.12
     short_visible: float = 0.15
     may_be_faint: float = 0.25
-    # Least extent of the gappy stripes of a net that may hang in front of all of a solid target, as
-    # a share of the target's search lines: fish have 0.5 at most.
+    # Least extent of the gappy stripes of a net that may hang in front of all of a target, as a
+    # share of the search lines of something solid, or of a net's extent: fish have 0.5 at most.
     min_extent: float = 0.6
     # With more light than this as well, it need not show all lasers: a coarse net has few strands.
     wide_share: float = 0.2
@@ -92,9 +92,9 @@ class _AssignmentOptions(NamedTuple):
     # Least share of the light of a surface if colour is no evidence: nets whose dashes lost their
     # chroma have 0.18 to 0.26.
     certain_share: float = 0.15
-    # Least visible share of the best stripe of something solid without colour: walls have 0.66 and
-    # more, a plane through peaks of a net and of what is behind it had 0.17.
-    certain_of_solid: float = 0.4
+    # Least visible share of the best stripe of something solid without colour, or that noise or a
+    # codec broke: walls have 0.66 and more, a plane through a net and what is behind it had 0.17.
+    filled: float = 0.4
     # With less light than this, a surface is there by chance whatever else it shows: specks of a
     # fouled net that made a plane at a third of its range had 0.05, 1,100 nets and walls in
     # rendered dives 0.075 and more.
@@ -226,13 +226,19 @@ class AssignmentTest:
         candidates, subsegments, surfaces, target
             As in `is_by_chance`.
         """
-        others = [one for one in surfaces if one is not target and one.is_mesh]
-        if any(_is_nearer(one, target, subsegments) for one in others):
-            return False
+        for one in surfaces:
+            is_wide = one.is_mesh and one.extent >= _ODDS.min_extent * target.extent
+            if one is not target and is_wide and _is_nearer(one, target, subsegments):
+                return False
         share = self._light_share(candidates, subsegments, surfaces, target)
-        visible, _, _, n_even = self._visibility(target, subsegments)
-        few, least = 3, _ODDS.small_share if target.is_mesh else _ODDS.certain_of_solid
-        return share >= _ODDS.certain_share and visible >= least and n_even >= few
+        visible, faint, _, n_even = self._visibility(target, subsegments)
+        few, least = 3, _ODDS.small_share if target.is_mesh else _ODDS.filled
+        is_even = n_even >= few and faint <= _ODDS.may_be_faint
+        return is_even and share >= _ODDS.certain_share and visible >= least
+
+    def fills_lines(self, subsegments: Subsegments, surface: Surface) -> bool:
+        """Return whether a surface shows as much of its best stripe as something solid."""
+        return self._visibility(surface, subsegments)[0] >= _ODDS.filled
 
     def overlooked(
         self,
