@@ -148,11 +148,9 @@ DETECTORS: dict[str, type[DetectorOptions]] = {
 class _SampleOptions(NamedTuple):
     """Sample of a frame's search lines, from which the contrast threshold follows."""
 
-    # One search line in this many is sampled first, or as many as hold this number of the peaks
-    # that the lasers can make. The threshold is raised until there are at most this many times as
-    # many peaks as that.
+    # One search line in this many is sampled first. The threshold is raised until there are at most
+    # this many times as many peaks as the lasers can make.
     sample_every: int = 48
-    min_sample: float = 30.0
     max_peaks: float = 2.0
     # A picture with fewer peaks than this many times that number is quiet.
     quiet: float = 0.25
@@ -433,12 +431,11 @@ class FrameDetector:
         and only colour separates them from faint texture. Above the threshold there are not many
         more peaks than the lasers can make.
         """
-        every = max(1, min(_SAMPLE.sample_every, int(self._n_possible / _SAMPLE.min_sample)))
-        n_possible = self._n_possible / every
-        _, sample, _ = self._find(images, least, every)
+        n_possible = self._n_possible / _SAMPLE.sample_every
+        _, sample, _ = self._find(images, least, _SAMPLE.sample_every)
         if has_colour and sample.shape[1] < _SAMPLE.quiet * n_possible:
             least = (least + 1) // 2
-            _, sample, _ = self._find(images, least, every)
+            _, sample, _ = self._find(images, least, _SAMPLE.sample_every)
         most = _SAMPLE.max_peaks * n_possible
         heights = np.sort(sample[HEIGHT])
         n = len(heights)
