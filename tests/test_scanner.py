@@ -337,6 +337,20 @@ def test_lasers_on_different_surfaces_share_no_plane() -> None:
     assert reason(found.posture) is Reason.NOT_A_PLANE
 
 
+def test_two_lasers_in_a_corner_show_no_plane_between_its_walls() -> None:
+    """A plane may meet the stripe on one wall, and a few places of the one on the other."""
+    left, normal = plane(0.705, 0.0, 20.0), plane(1.0, 0.0, -50.0).normal
+    right = Plane(normal, float(normal @ np.array([0.05, 0.75, 0.0])))
+    walls = [
+        (left, lambda points: right.signed_distance(points) < 0.0),
+        (right, lambda points: left.signed_distance(points) < 0.0),
+    ]
+    rig = example_rig()
+    rig = replace(rig, lasers=rig.lasers[1:])
+    found = Scanner(rig).measure(0, 0.0, peaks_of(rig, walls, 0.1))
+    assert reason(found.posture) is Reason.ONE_LASER
+
+
 def dash(points: FloatArray) -> BoolArray:
     """A piece of stripe 20 mm high, as on a fish."""
     lit: BoolArray = np.abs(points[..., 2]) < 0.01

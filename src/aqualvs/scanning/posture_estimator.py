@@ -94,8 +94,10 @@ _FLANK_STRANDS, _FLANK_INTENSITY = 0.73, 0.76
 # Squared Mahalanobis distance between two postures: its expected value if they differ by chance,
 # and the quantile 0.999 (chi-squared, 3 degrees of freedom).
 _EXPECTED, _CONTRADICTS = 3.0, 16.27
-# Least number of observations of the second best laser.
-_MIN_OBSERVATIONS = 3
+# Least number of observations of the second best laser, and, on something solid, their least mean
+# weight in the fit: 0.75 and more on rendered walls, 0.2 at most where two lasers each show another
+# wall of a corner.
+_MIN_OBSERVATIONS, _MIN_WEIGHT = 3, 0.4
 
 
 class FitMethod(StrEnum):
@@ -180,6 +182,9 @@ class PostureEstimator:
         if fit is None:
             refusal = Refusal(Reason.COLLINEAR, "the points do not fix a plane")
             return Measurement.refused(refusal, candidates.n)
+        if not mesh and _n_agreeing(seen.observations.laser, fit.weights) < 2:
+            detail = "most of the light of all lasers but one is off the plane"
+            return Measurement.refused(Refusal(Reason.ONE_LASER, detail), candidates.n)
         flat = self._posture_of_fit(candidates, seen, fit)
         found = flat
         if mesh and self._fit_method is FitMethod.ROBUST:
@@ -536,6 +541,12 @@ def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
         return 1.0
     strands = seen.observations
     return share_near(strands.points, strands.laser, patch, _NEAR_SHARE * plane.offset)
+
+
+def _n_agreeing(laser: IntArray, weights: FloatArray) -> int:
+    """Return the number of lasers whose observations have a high weight in a fit, in the mean."""
+    least = _MIN_WEIGHT * np.maximum(np.bincount(laser), 1)
+    return int(np.count_nonzero(np.bincount(laser, weights) >= least))
 
 
 def _plane_of(fit: PlaneFit) -> Plane:
