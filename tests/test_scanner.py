@@ -339,7 +339,7 @@ def test_lasers_on_different_surfaces_share_no_plane() -> None:
 
 def test_two_lasers_in_a_corner_show_no_plane_between_its_walls() -> None:
     """A plane may meet the stripe on one wall, and a few places of the one on the other."""
-    left, normal = plane(0.705, 0.0, 20.0), plane(1.0, 0.0, -50.0).normal
+    left, normal = plane(0.705, 0.0, 20.0), plane(1.0, 0.0, -40.0).normal
     right = Plane(normal, float(normal @ np.array([0.05, 0.75, 0.0])))
     walls = [
         (left, lambda points: right.signed_distance(points) < 0.0),

@@ -94,10 +94,10 @@ _FLANK_STRANDS, _FLANK_INTENSITY = 0.73, 0.76
 # Squared Mahalanobis distance between two postures: its expected value if they differ by chance,
 # and the quantile 0.999 (chi-squared, 3 degrees of freedom).
 _EXPECTED, _CONTRADICTS = 3.0, 16.27
-# Least number of observations of the second best laser, and, on something solid, their least mean
-# weight in the fit: 0.75 and more on rendered walls, 0.2 at most where two lasers each show another
-# wall of a corner.
-_MIN_OBSERVATIONS, _MIN_WEIGHT = 3, 0.4
+# Least number of observations of the second best laser, and, where two lasers alone show something
+# solid, their least mean weight in the fit: 0.75 and more on rendered walls, 0.2 at most where each
+# shows another wall of a corner.
+_MIN_OBSERVATIONS, _MIN_WEIGHT = 3, 0.3
 
 
 class FitMethod(StrEnum):
@@ -182,8 +182,8 @@ class PostureEstimator:
         if fit is None:
             refusal = Refusal(Reason.COLLINEAR, "the points do not fix a plane")
             return Measurement.refused(refusal, candidates.n)
-        if not mesh and _n_agreeing(seen.observations.laser, fit.weights) < 2:
-            detail = "most of the light of all lasers but one is off the plane"
+        if not mesh and _do_two_disagree(seen.observations.laser, fit.weights):
+            detail = "two lasers show the plane, and most of the light of one is off it"
             return Measurement.refused(Refusal(Reason.ONE_LASER, detail), candidates.n)
         flat = self._posture_of_fit(candidates, seen, fit)
         found = flat
@@ -543,10 +543,12 @@ def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
     return share_near(strands.points, strands.laser, patch, _NEAR_SHARE * plane.offset)
 
 
-def _n_agreeing(laser: IntArray, weights: FloatArray) -> int:
-    """Return the number of lasers whose observations have a high weight in a fit, in the mean."""
-    least = _MIN_WEIGHT * np.maximum(np.bincount(laser), 1)
-    return int(np.count_nonzero(np.bincount(laser, weights) >= least))
+def _do_two_disagree(laser: IntArray, weights: FloatArray) -> bool:
+    """Return whether two lasers alone show a surface, and one has a low mean weight in the fit."""
+    n = np.bincount(laser)
+    lit = n > 0
+    weight = np.bincount(laser, weights)[lit] / n[lit]
+    return len(weight) == 2 and bool((weight < _MIN_WEIGHT).any())
 
 
 def _plane_of(fit: PlaneFit) -> Plane:
