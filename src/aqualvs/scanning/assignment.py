@@ -237,8 +237,16 @@ class AssignmentTest:
         return is_even and share >= _ODDS.certain_share and visible >= least
 
     def fills_lines(self, subsegments: Subsegments, surface: Surface) -> bool:
-        """Return whether a surface shows as much of its best stripe as something solid."""
-        return self._visibility(surface, subsegments)[0] >= _ODDS.filled
+        """Return whether a surface shows as much of its best stripe as something solid.
+
+        One laser may light a strand that lies along its sheet: the others must show as much as
+        broken lines do.
+        """
+        mine, least_of_mean = surface.members, 0.75
+        lines = np.bincount(subsegments.laser[mine], subsegments.n_lines[mine])
+        mean_of_best = lines.sum() / (np.count_nonzero(lines) * lines.max())
+        filled = self._visibility(surface, subsegments)[0] / _ODDS.filled
+        return bool(filled >= 1.0 and filled * mean_of_best >= least_of_mean)
 
     def overlooked(
         self,

@@ -94,10 +94,8 @@ _FLANK_STRANDS, _FLANK_INTENSITY = 0.73, 0.76
 # Squared Mahalanobis distance between two postures: its expected value if they differ by chance,
 # and the quantile 0.999 (chi-squared, 3 degrees of freedom).
 _EXPECTED, _CONTRADICTS = 3.0, 16.27
-# Least number of observations of the second best laser, and, where two lasers alone show something
-# solid, their least mean weight in the fit: 0.75 and more on rendered walls, 0.2 at most where each
-# shows another wall of a corner.
-_MIN_OBSERVATIONS, _MIN_WEIGHT = 3, 0.3
+# Least number of observations of the second best laser.
+_MIN_OBSERVATIONS = 3
 
 
 class FitMethod(StrEnum):
@@ -545,10 +543,12 @@ def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
 
 def _do_two_disagree(laser: IntArray, weights: FloatArray) -> bool:
     """Return whether two lasers alone show a surface, and one has a low mean weight in the fit."""
+    # Walls have 0.75 and more; where each laser shows another wall of a corner, 0.2 at most.
+    min_weight = 0.3
     n = np.bincount(laser)
     lit = n > 0
     weight = np.bincount(laser, weights)[lit] / n[lit]
-    return len(weight) == 2 and bool((weight < _MIN_WEIGHT).any())
+    return len(weight) == 2 and bool((weight < min_weight).any())
 
 
 def _plane_of(fit: PlaneFit) -> Plane:
