@@ -229,7 +229,8 @@ class Scanner:
         finds_stripes = isinstance(self.options.detector, StripeOptions)
         if not finds_stripes or refusal or refusal.reason not in hardly_any:
             return peaks, scan
-        tallest = self._search(frame.index).detector.detect_tallest(frame)
+        by_luma = peaks if frame.chroma is None else self.detect(replace(frame, chroma=None))
+        tallest = self._search(frame.index).detector.tallest(by_luma)
         again = self.measure(frame.index, frame.time_s, tallest, has_colour=False)
         return (tallest, again) if again.posture else (peaks, scan)
 

@@ -5,7 +5,6 @@ peaks in them within the lasers' bands.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -337,25 +336,19 @@ class FrameDetector:
             found[SearchAxis.ALONG_Y] = _in_picture(found[SearchAxis.ALONG_Y], self._field)
         return found
 
-    def detect_tallest(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
-        """Find the tallest peaks by luma alone, fewer than the lasers can make.
+    def tallest(self, peaks: dict[SearchAxis, StripePeaks]) -> dict[SearchAxis, StripePeaks]:
+        """Return the tallest peaks of a frame, fewer than the lasers can make.
 
         Lamps and daylight make many more peaks on twine, but lower ones than the lasers.
-
-        Parameters
-        ----------
-        frame, and what is returned and raised
-            As in `detect`.
         """
-        found = self.detect(replace(frame, chroma=None))
         most = int(_SAMPLE.tallest * self._n_possible)
-        heights = np.concatenate([np.empty(0), *(peaks.height for peaks in found.values())])
+        heights = np.concatenate([np.empty(0), *(found.height for found in peaks.values())])
         if most >= len(heights):
-            return found
+            return peaks
         least = np.partition(heights, -most)[-most]
         return {
-            axis: StripePeaks(*(column[peaks.height >= least] for column in peaks))
-            for axis, peaks in found.items()
+            axis: StripePeaks(*(column[found.height >= least] for column in found))
+            for axis, found in peaks.items()
         }
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, StripePeaks]:
