@@ -338,8 +338,7 @@ class Scanner:
             surfaces = _with_replaced(choice.surfaces, other)
             changed = choice._replace(surfaces=surfaces, target=other)
             again = self._measure_target(stripes, changed)
-            # A rough wall is no net in folds.
-            if not measurement.posture or (again.posture and not again.folded):
+            if not measurement.posture or _is_better(again, measurement):
                 choice, measurement = changed, again
         # The kind of surface that every point lies on.
         points, rows = label_candidates(
@@ -522,15 +521,17 @@ def _as_other_kind(
 ) -> Surface | None:
     """Return a target as solid, or as a net, if it is likely to be that.
 
-    Noise and codecs break the lines of a dim picture as twine does: a net whose strands are too few
-    for a posture is solid if it is lit on much of its lines. Growth fills the gaps of a net: what
-    has small gaps only, but no long lines either, and is rough, is a net.
+    Noise and codecs break the lines of a dim or overexposed picture as twine does: a net whose
+    strands are too few for a posture, or lie in no plane, is solid if it is lit on much of its
+    lines. Growth fills the gaps of a net: what has small gaps only, but no long lines either, and
+    is rough, is a net.
     """
     if target is None:
         return None
-    too_little = (Reason.ONE_LASER, Reason.COLLINEAR, Reason.TOO_FEW_POINTS)
+    no_net = (Reason.ONE_LASER, Reason.COLLINEAR, Reason.TOO_FEW_POINTS, Reason.NOT_A_PLANE)
     posture = measurement.posture
-    if target.is_mesh and isinstance(posture, Refusal) and posture.reason in too_little:
+    is_no_net = isinstance(posture, Refusal) and posture.reason in no_net
+    if target.is_mesh and (is_no_net or measurement.folded):
         is_solid = stripes.assignment.fills_lines(stripes.subsegments, target)
         return replace(target, is_mesh=False) if is_solid else None
     # Points scatter about walls by 0.15 to 0.5 px, in strong sun by 0.8, about grown nets that pass
@@ -540,6 +541,17 @@ def _as_other_kind(
         is_net = not target.is_mesh and not target.is_unbroken
         return replace(target, is_mesh=True) if is_net else None
     return None
+
+
+def _is_better(again: Measurement, before: Measurement) -> bool:
+    """Return whether a target is better measured as of the other kind."""
+    # A rough wall is no net in folds.
+    if not (again.posture and before.posture) or again.folded:
+        return False
+    # Ratio of the scatter about a wall to that about the mean plane of what were no folds: 0.1 on
+    # overexposed photographs of a wall. Nets in folds, fitted as solid, have 0.4 and more.
+    clearly_less = 0.25
+    return not before.folded or again.posture.rms < clearly_less * before.posture.rms
 
 
 def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:

@@ -149,6 +149,18 @@ def test_faint_lines_of_a_quiet_picture_are_measured(tmp_path, picture: str, fmt
     assert_on_board(measured_as(fmt, veiled, picture, tmp_path))
 
 
+OVEREXPOSED = [("image2", 1.8, "crf23"), ("image2", 1.9, "jpg50"), ("image5", 2.0, "crf28")]
+
+
+@pytest.mark.parametrize(("picture", "light", "fmt"), OVEREXPOSED)
+def test_lines_in_pieces_on_an_overexposed_wall_are_no_net(
+    tmp_path, picture: str, light: float, fmt: str
+) -> None:
+    """Lines as white as the wall are lost in places, and specks between them are as coloured."""
+    bright = np.clip(np.rint(light * photograph(picture)), 0, 255).astype(np.uint8)
+    assert_on_board(measured_as(fmt, bright, picture, tmp_path))
+
+
 def test_a_pale_picture_is_measured_without_the_colour_that_the_codec_dropped(tmp_path) -> None:
     """A flat picture profile and H.264 leave the lines their height, and hardly any chroma."""
     picture = PICTURES[1]
