@@ -27,6 +27,7 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame, planes_of_image
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.images import read_image
 from laser_cases import laser_error
 from repository import ROOT
@@ -159,6 +160,43 @@ def test_lines_in_pieces_on_an_overexposed_wall_are_no_net(
     """Lines as white as the wall are lost in places, and specks between them are as coloured."""
     bright = np.clip(np.rint(light * photograph(picture)), 0, 255).astype(np.uint8)
     assert_on_board(measured_as(fmt, bright, picture, tmp_path))
+
+
+def in_pieces(peaks: StripePeaks, rng: np.random.Generator) -> StripePeaks:
+    """Keep a quarter of stripes, in pieces of ten search lines, and add specks beside them."""
+    piece, place, n_specks, offset_px = 10, 40, 150, 4.0
+    is_lit = rng.random((peaks.line.max() // piece + 1, 50)) < 0.25
+    lit = np.flatnonzero(is_lit[peaks.line // piece, peaks.position.astype(int) // place])
+    beside = rng.integers(0, peaks.n, n_specks)
+    rows = np.concatenate([lit, beside])
+    position = peaks.position[rows]
+    position[len(lit) :] += rng.normal(0.0, offset_px, n_specks)
+    height = peaks.height[rows]
+    height[len(lit) :] *= 0.6
+    all_peaks = StripePeaks(*(column[rows] for column in peaks))
+    all_peaks = all_peaks._replace(position=position, height=height)
+    return StripePeaks(*(column[np.lexsort((position, all_peaks.line))] for column in all_peaks))
+
+
+def test_pieces_of_three_lines_among_specks_are_no_net_in_folds() -> None:
+    """Specks are more than the pieces of line, but have less light."""
+    frame = Frame(0, 0.0, *planes_of_image(photograph("image5")))
+    rig = load_rig(PHOTOGRAPHS / "rig.yaml")
+    scanner = Scanner(rig)
+    ((axis, peaks),) = scanner.detect(frame).items()
+    points = scanner.process(frame).points
+    three = np.flatnonzero(points.used & np.isin(points.laser, (6, 7, 8)))
+    of_three = np.isin(np.round(peaks.position, 3), np.round(points.pixels[three, 0], 3))
+    few = Scanner(replace(rig, lasers=rig.lasers[6:9], solved_from={}))
+    whole = StripePeaks(*(column[of_three] for column in peaks))
+    posture = few.measure(0, 0.0, {axis: whole}).posture
+    assert posture, posture
+    drawn = [in_pieces(whole, np.random.default_rng(seed)) for seed in range(20)]
+    broken = [few.measure(0, 0.0, {axis: peaks}).posture for peaks in drawn]
+    ranges = [one.range for one in broken if one]
+    # The others show one laser only.
+    assert len(ranges) >= 18
+    assert ranges == pytest.approx([posture.range] * len(ranges), rel=0.02)
 
 
 def test_a_pale_picture_is_measured_without_the_colour_that_the_codec_dropped(tmp_path) -> None:

@@ -310,9 +310,9 @@ class PostureEstimator:
             patch,
             _NEAR_SHARE * plane.offset,
         )
-        is_folded = share <= _FOLDED_STRANDS
+        # With most of the light on the surface, many strands beside it are specks.
         may_be_flank = share < _FLANK_STRANDS and intensity_share < _FLANK_INTENSITY
-        if best and not (is_folded or may_be_flank):
+        if best and not may_be_flank:
             return self._inflated_by_mean(best, seen, plane, intensity_share)
         mean = self._reselected(candidates, net_mask, self._mean_plane(candidates, seen, plane))
         if mean is None:
@@ -322,6 +322,7 @@ class PostureEstimator:
             if not (one and other):
                 return None
             if disagreement(one, other) <= _CONTRADICTS:
+                is_folded = share <= _FOLDED_STRANDS
                 return self._inflated_by_all(best, seen, intensity_share, folded=is_folded)
         return self._inflated_by_all(mean.found, mean.seen, mean.share, folded=True)
 
