@@ -15,6 +15,7 @@ from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig, load_scenario
@@ -140,6 +141,33 @@ def test_two_long_stripes_are_found_among_the_specks_of_caustics() -> None:
     found = posture_by(rig, scene, 0.9)
     assert found, found
     assert found.range == pytest.approx(0.9, rel=3e-4)
+
+
+def test_wide_specks_of_a_rough_wall_are_no_net_before_it() -> None:
+    """Where lines are hardly higher than texture, as much light is in wide specks as in them."""
+    pose = dome_from_target(0.9, np.deg2rad(3.0), np.deg2rad(-4.0))
+    scene = Scene(dome_from_scene=pose, walls=(Wall(),), target="wall")
+    picture = quick(SMALL).render(scene, 0.0, np.random.default_rng(1))
+    scanner = scanner_of(SMALL)
+    peaks = scanner.detect(frame_of(0, 0.0, picture.image))
+    rng, specks = np.random.default_rng(5), {}
+    for axis, found in peaks.items():
+        n, width = 400, rng.uniform(8.0, 30.0, 400)
+        low, high = found.position.min(), found.position.max()
+        added = StripePeaks(
+            rng.integers(0, found.line.max(), n),
+            rng.uniform(low, high, n),
+            np.full(n, 0.5 * np.median(found.height)),
+            width,
+            np.ones(n),
+            np.zeros(n),
+        )
+        both = StripePeaks(*(np.concatenate(pair) for pair in zip(found, added, strict=True)))
+        order = np.lexsort((both.position, both.line))
+        specks[axis] = StripePeaks(*(column[order] for column in both))
+    posture = scanner.measure(0, 0.0, specks).posture
+    assert posture, posture
+    assert posture.range == pytest.approx(0.9, rel=1e-3)
 
 
 def test_the_glow_of_the_sheets_in_turbid_water_moves_no_wall() -> None:

@@ -322,10 +322,10 @@ class AssignmentTest:
             target.plane.packed(),
             self._searched[0],
         )
-        # Loose light in front of something solid, over its own light. Rendered walls have 0.01 at
-        # most, among fish, bubbles and caustics 0.19, real ones with 15 lasers, whose lines are
-        # nearly hidden by noise, 0.09; walls behind a folded net have 0.21 to 0.83.
-        max_loose_share = 0.21
+        # Loose light in front of something solid, over its own light. Rendered walls have up to
+        # 0.06 with faint lines on rough texture, 0.10 among fish, bubbles and caustics; walls
+        # behind a folded net have 0.20 to 0.74.
+        max_loose_share = 0.15
         return bool(share > max_loose_share)
 
     def other_lines(

@@ -45,6 +45,8 @@ class _LightOptions(NamedTuple):
     # Subsegments within this many gates of a plane are on it: lasers whose calibration is less
     # accurate than the peaks must not count as dark, nor their light as foreign.
     wide: float = 2.5
+    # Ratio of a peak's width to that of a surface's stripes from which it is no laser's.
+    wide_peak: float = 2.5
     # Least number of cells to judge a laser; with a smaller share of lit cells than this, relative
     # to that of the other lasers, it is dark.
     min_cells: int = 3
@@ -537,8 +539,9 @@ def loose_share_before(
 ) -> float:
     """Return the loose light in front of a surface, over the surface's own light.
 
-    Loose light is that of peaks in short components on no surface. Peaks that some laser may have
-    made at or behind the surface are not counted: with many lasers, these are nearly all noise.
+    Loose light is that of peaks in short components on no surface, about as wide as the stripes on
+    the surface: wider ones are its texture, or caustics. Peaks that some laser may have made at or
+    behind the surface are not counted: with many lasers, these are nearly all noise.
 
     Parameters
     ----------
@@ -556,14 +559,14 @@ def loose_share_before(
         Least distance along the forward axis, in metres.
     """
     source, points, n = candidates.source, candidates.points, n_bins(candidates.source)
-    light = np.zeros(n)
+    light, width = np.zeros((2, n))
     own, bound = np.zeros((2, n), np.bool_)
     for i in range(source.shape[0]):
         c, r = of_candidate[i], source[i]
         off = -plane[3]
         for k in range(3):
             off += plane[k] * points[i, k]
-        light[r] = candidates.confidence[i]
+        light[r], width[r] = candidates.confidence[i], candidates.width[i]
         own[r] |= members[c]
         # A peak is bound if any of its candidates is, whatever the laser.
         bound[r] |= (
@@ -572,11 +575,15 @@ def loose_share_before(
             or off > -_LIGHT.before * plane[3]
             or points[i, 1] <= nearest
         )
-    of_surface, loose = 0.0, 0.0
+    of_surface, total_width = 1e-12, 0.0
     for r in range(n):
-        of_surface += light[r] if own[r] else 0.0
-        loose += 0.0 if bound[r] else light[r]
-    return loose / max(of_surface, 1e-12)
+        if own[r]:
+            of_surface += light[r]
+            total_width += light[r] * width[r]
+    widest, loose = _LIGHT.wide_peak * total_width / of_surface, 0.0
+    for r in range(n):
+        loose += light[r] if not bound[r] and width[r] <= widest else 0.0
+    return loose / of_surface
 
 
 @lazy_kernel
