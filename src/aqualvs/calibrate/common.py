@@ -56,7 +56,7 @@ from aqualvs.text import count_text
 from aqualvs.yamlfile import parse_yaml, read_text
 
 WATER_N = 1.3340
-"""Default index: fresh water of 15 °C in green light."""
+"""Default index: fresh water in green light has 1.334 to 1.336, the sea 1.340 to 1.343."""
 N_LASERS = "n_lasers"
 """Key of `Rig.solved_from`: planned number of lasers of a rig that has none yet."""
 WAVELENGTH_NM = "wavelength_nm"

@@ -41,12 +41,20 @@ from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet, View
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import Laser, Rig, RigUncertainty, common_wavelength, merged
+from aqualvs.optics.rig import (
+    LASER_PARAMETERS,
+    Laser,
+    Rig,
+    RigUncertainty,
+    common_wavelength,
+    merged,
+)
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.rigschema import LASER_NM, LASER_NM_REMEDY
 from aqualvs.optics.solved import (
     ASSUMED,
     SolvedStep,
+    assumptions,
     completed_uncertainty,
     file_parameter_name,
     rig_uncertainty,
@@ -191,7 +199,7 @@ def calibrate_lasers(
         uncertainty=result.uncertainty,
         residuals_px={one.name: one.corner_residuals_px for one in result.views},
         left_out={**target.found.missed, **result.left_out},
-        notes=(*target.found.notes, *result.warnings),
+        notes=(*target.found.notes, *_assumed(before), *result.warnings),
         solution=result,
         found=(target.found,),
         n_medium=target.n_medium,
@@ -218,7 +226,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
         refine=request.refine,
         wavelength_nm=request.wavelength_nm,
     )
-    for warning in done.solution.warnings:
+    for warning in (*_assumed(before), *done.solution.warnings):
         echo(f"note: {warning}")
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_laser_text(figures, laser))
@@ -239,6 +247,26 @@ def _camera_uncertainty(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncert
     known = completed_uncertainty(rig)
     left_out = {"n_water"} - set(own.names) if elsewhere else set()
     return known.only([name for name in known.names if name not in left_out])
+
+
+def _assumed(rig: Rig) -> list[str]:
+    """Return remarks on numbers of camera, housing and water that no calibration determined."""
+    # The lasers are this step's.
+    solved_here = {f"{laser.name}:{LASER_PARAMETERS[0]}" for laser in rig.lasers}
+    remarks = []
+    for one in assumptions(rig):
+        if "n_water" in one.uncertainty.names:
+            remarks.append(
+                f"the water's index {rig.n_water:.4f} was not calibrated, and counts as known to "
+                f"{one.words}; fresh water has 1.334 to 1.336, the sea 1.340 to 1.343: run "
+                "'aqualvs calibrate water' next, by pictures or by temperature and salinity"
+            )
+        elif solved_here.isdisjoint(one.uncertainty.names):
+            remarks.append(
+                f"the {one.what} was not calibrated, and counts as known to {one.words}; wrong by "
+                "more, it spoils the lasers: run the steps before this one"
+            )
+    return remarks
 
 
 def _with_wavelength(rig: Rig, wavelength_nm: float | None) -> Rig:
@@ -404,6 +432,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             ),
         ),
         warnings=(
+            *_assumed(before),
             *result.warnings,
             *(f"{name}: {why}" for name, why in result.left_out.items()),
             *found.remarks,

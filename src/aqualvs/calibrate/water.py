@@ -185,7 +185,7 @@ def _found_in(
 def _check_observable(result: WaterCalibration) -> None:
     """Raise `CalibrationError` if neither the pictures nor a prior determine the index."""
     if not result.observable and not any(reading.prior_used for reading in result.readings):
-        why = " ".join(result.remarks) or (
+        why = "; ".join(result.remarks) or (
             "the lens is too near the centre of the dome; give temperature and salinity"
         )
         raise CalibrationError(

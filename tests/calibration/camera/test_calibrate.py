@@ -150,6 +150,15 @@ def test_outlying_corners_and_views_are_named() -> None:
     assert np.abs(_normalised(found, LENS)).max() < 4.0
 
 
+def test_a_picture_turned_by_half_a_turn_is_named() -> None:
+    """Its corners fit ten times worse than those of the others, by too little to leave it out."""
+    views = _shots(noise_px=0.01)
+    views[4] = replace(views[4], pixels=np.array(SIZE) - 1.0 - views[4].pixels)
+    text = "\n".join(camera(views, SIZE).findings)
+    assert "corners of v4" in text
+    assert "upside down" in text
+
+
 def test_tells_where_the_picture_was_not_covered() -> None:
     views = []
     for view in _shots(n=20):

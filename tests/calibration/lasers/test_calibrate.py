@@ -353,6 +353,31 @@ def test_a_wrong_medium_is_refused() -> None:
         calibrate_lasers(RIG.in_water(1.0003), box_seen(), box())
 
 
+@pytest.mark.parametrize(("taken_in", "said"), [("air", RIG.n_water), ("water", 1.0003)])
+def test_pictures_in_the_other_medium_are_refused_with_the_remedy(
+    taken_in: str, said: float
+) -> None:
+    """A few hundredths of a degree are left in corners, but a degree in the lasers."""
+    seen = RIG.in_water(1.0003) if taken_in == "air" else RIG
+    views = simulated(
+        seen, [dome_from_board(i) for i in range(4)], board_corners(), board_surface(), noise=NOISE
+    )
+    with pytest.raises(CalibrationError, match=f"Give --medium {taken_in}"):
+        calibrate_lasers(RIG, views, board_surface(), options=LaserOptions(n_medium=said))
+
+
+def test_a_laser_that_was_off_in_most_pictures_is_mentioned() -> None:
+    rig, two = without_lasers(RIG), replace(RIG, lasers=RIG.lasers[:2])
+    surfaces = board_surface()
+    poses = [dome_from_board(i) for i in range(len(BOARD_POSES))]
+    all_on = simulated(RIG, poses[:2], board_corners(), surfaces, noise=NOISE, spacing=0.004)
+    two_on = simulated(two, poses[2:], board_corners(), surfaces, noise=NOISE, spacing=0.004)
+    renamed = [replace(v, view=replace(v.view, name=f"two_{i}.png")) for i, v in enumerate(two_on)]
+    result = calibrate_lasers(rig, [*all_on, *renamed], surfaces)
+    assert len(result.lasers) == 2
+    assert any("belong" in words for words in result.warnings)
+
+
 def test_a_medium_that_is_a_little_wrong_is_mentioned() -> None:
     result = calibrate_lasers(RIG.in_water(1.25), box_seen(), box())
     assert any("check the rig, the medium" in words for words in result.warnings)

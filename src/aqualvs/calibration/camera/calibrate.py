@@ -315,11 +315,33 @@ def _findings(result: CameraCalibration) -> list[str]:
             f"corners of views held out are predicted to {result.cross_validation_rms_px:.3f} px"
         )
     lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
+    lines += _odd_views(result)
     for fit in result.views:
         wrong = int(np.count_nonzero(~fit.inliers))
         if wrong > many_outliers * len(fit.view):
             lines.append(f"{fit.label}: {wrong} of its {len(fit.view)} corners do not fit")
     return lines + _weak_places(result)
+
+
+def _odd_views(result: CameraCalibration) -> list[str]:
+    """Return remarks on views that were used, but fit much worse than the others."""
+    # As of views that are left out, but at an error that may still be of the corners.
+    odd_view, odd_noise_px = 5.0, 0.1
+    rms = [fit.rms_px for fit in result.views]
+    typical = float(np.median(rms))
+    odd = [
+        (fit.label, one)
+        for fit, one in zip(result.views, rms, strict=True)
+        if one > max(odd_view * typical, odd_noise_px)
+    ]
+    if not odd:
+        return []
+    names = ", ".join(f"{name} ({one:.2g} px)" for name, one in odd)
+    return [
+        f"corners of {names} are far more off than those of other views ({typical:.2g} px), and "
+        "count for little; turned upside down by the camera, blurred, or the board bent? Leave "
+        "them out or take them again"
+    ]
 
 
 def _shared_errors(result: CameraCalibration) -> list[str]:

@@ -52,7 +52,8 @@ def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: in
     most, remedy = max(counts, key=lambda count: count[0])
     if most >= _ENOUGH:
         return f"{read}, but not as on this board; {remedy}"
-    return f"{read}, but not as on this board ({_ids(markers)}); check its squares and dictionary"
+    remedy = "check its squares, marker_mm and dictionary"
+    return f"{read}, but not as on this board ({_ids(markers)}); {remedy}"
 
 
 def _other_boards(board: Board) -> Iterator[tuple[Board, str]]:

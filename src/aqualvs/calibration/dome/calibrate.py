@@ -127,7 +127,10 @@ def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
     sigmas = ", ".join(f"{axis} {value:.4f}" for axis, value in zip("xyz", sigma, strict=True))
     exact = any(shot.kind is PoseKind.EXACT for shot in problem.shots)
     source = "boards at known poses" if exact else "most boards standing square to the dome"
-    return f"camera rotation: from {source}; uncertain by {sigmas} deg about the dome's axes"
+    shared = "" if exact else ", and by a tilt that all these boards share"
+    return (
+        f"camera rotation: from {source}; uncertain by {sigmas} deg about the dome's axes{shared}"
+    )
 
 
 def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:

@@ -16,6 +16,7 @@ from aqualvs.calibration.lasers.checks import (
     ViewFigures,
     check_count,
     check_distances,
+    check_medium,
     check_poses,
     check_size,
     far_apart,
@@ -109,6 +110,7 @@ def calibrate_lasers(
     check_size(views)
     seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
     placed, left_out = place_views(seen_rig.camera(), views, surfaces)
+    check_medium(placed, rig, seen_rig)
     check_poses(placed)
     check_distances(placed, rig)
     lasers, laser_of, warnings = _sorted_stripes(rig, placed, surfaces, options)

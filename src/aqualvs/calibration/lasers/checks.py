@@ -18,6 +18,7 @@ from aqualvs.calibration.lasers.problem import LaserProblem, LaserState, distanc
 from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, way_along
 from aqualvs.calibration.lasers.views import LaserView, PlacedView, pose_difference
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
+from aqualvs.calibration.solver.initial_pose import target_pose
 from aqualvs.calibration.solver.least_squares import Solution
 from aqualvs.calibration.solver.result import rms_px
 from aqualvs.errors import CalibrationError
@@ -310,6 +311,47 @@ def check_poses(views: Sequence[PlacedView]) -> None:
         )
 
 
+def check_medium(views: Sequence[PlacedView], rig: Rig, seen_rig: Rig) -> None:
+    """Refuse pictures whose corners fit the other medium, air or the rig's water, far better.
+
+    Parameters
+    ----------
+    views : sequence of PlacedView
+        Placed in the stated medium.
+    rig : Rig
+        Before the calibration.
+    seen_rig : Rig
+        In the stated medium.
+
+    Raises
+    ------
+    CalibrationError
+        If so.
+    """
+    if rig.housing is None:
+        return
+    stated = seen_rig.n_water
+    other = max(rig.n_air, rig.n_water, key=lambda n: abs(n - stated))
+    camera = rig.in_water(other).camera()
+    there = []
+    for view in views:
+        try:
+            there.append(target_pose(camera, view.view).rms_px)
+        except CalibrationError:
+            there.append(np.inf)
+    misses = float(np.median([view.rms_px for view in views]))
+    # Ratio of the corners' residuals from which the other medium is the right one; through a lens
+    # at the dome's centre it is 1, and the medium does not matter.
+    far_better = 2.0
+    if misses > far_better * float(np.median(there)):
+        word = "air" if other == rig.n_air else "water"
+        raise CalibrationError(
+            f"the pictures fit n = {other:.4f} far better than the stated {stated:.4f}: corners "
+            f"miss by {np.median(there):.2g} instead of {misses:.2g} px (rms, median of "
+            f"{len(views)} pictures); were they taken in {word}? Give --medium {word}"
+        )
+
+
 def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
     """Refuse stripes at distances that indicate a wrong unit, or no stripes on the target.
 
@@ -318,7 +360,7 @@ def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
     if not any(len(view.placed) for view in views):
         raise CalibrationError(
             f"{views[0].view.name}: no stripe lies on the target's surfaces; switch the lasers on, "
-            "let them shine on it, and name their --wavelength-nm if they are red or blue"
+            "let them shine on it, and give the --wavelength-nm of their colour"
         )
     points = np.concatenate([view.placed.points_in_dome for view in views])
     distance = float(np.median(np.linalg.norm(points, axis=1)))
@@ -365,7 +407,13 @@ def check_count(
         for plane in split.spare
         if plane.verdict is PlaneVerdict.OTHER or plane in split.undecided
     ]
-    taken = [line for plane in split.spare for line in plane.members.tolist()]
+    # A plane that is named above has told of its stripes.
+    taken = [
+        line
+        for plane in split.spare
+        if plane.verdict is PlaneVerdict.OTHER or plane in split.undecided
+        for line in plane.members.tolist()
+    ]
     counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
     # Share of the weakest laser's points in a picture from which a further stripe is reported.
     as_strong = 0.5
