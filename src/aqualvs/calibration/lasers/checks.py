@@ -402,18 +402,17 @@ def check_count(
             f"{_planes(split.undecided, views, surfaces)}; give their number (--lasers N), or "
             f"{_remedy(surfaces)}"
         )
+    named_planes = [
+        plane
+        for plane in split.spare
+        if plane.verdict is PlaneVerdict.OTHER or plane in split.undecided
+    ]
     words = [
         f"a plane of light ({_plane(plane, views, surfaces)}) is not taken for a laser: {plane.why}"
-        for plane in split.spare
-        if plane.verdict is PlaneVerdict.OTHER or plane in split.undecided
+        for plane in named_planes
     ]
-    # A plane that is named above has told of its stripes.
-    taken = [
-        line
-        for plane in split.spare
-        if plane.verdict is PlaneVerdict.OTHER or plane in split.undecided
-        for line in plane.members.tolist()
-    ]
+    # Their stripes need no further remark; those of other planes do.
+    taken = [line for plane in named_planes for line in plane.members.tolist()]
     counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
     # Share of the weakest laser's points in a picture from which a further stripe is reported.
     as_strong = 0.5
