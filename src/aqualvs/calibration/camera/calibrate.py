@@ -328,7 +328,8 @@ def _odd_views(result: CameraCalibration) -> list[str]:
     # As of views that are left out, but at an error that may still be of the corners.
     odd_view, odd_noise_px = 5.0, 0.1
     rms = [fit.rms_px for fit in result.views]
-    typical = float(np.median(rms))
+    # Half of the pictures may be turned.
+    typical = float(np.quantile(rms, 0.25))
     odd = [
         (fit.label, one)
         for fit, one in zip(result.views, rms, strict=True)
