@@ -86,17 +86,52 @@ def test_scattered_points_do_not_mislead() -> None:
     assert len(split.planes) == 3
 
 
-def test_a_pencil_of_fifteen_near_parallel_lasers() -> None:
+def pencil() -> Rig:
+    """A rig of fifteen lasers from one emitter."""
     emitter = np.array([0.06, 0.02, 0.05])
     lasers = []
     for i, angle in enumerate(np.deg2rad(np.linspace(-20.0, 4.0, 15))):
         normal = np.array([np.cos(angle), -np.sin(angle), 0.1])
         lasers.append(Laser(f"laser_{i + 1}", Plane.from_normal(normal, float(normal @ emitter))))
-    rig = replace(RIG, lasers=tuple(lasers))
-    views = board_views(rig, noise=NOISE)
+    return replace(RIG, lasers=tuple(lasers))
+
+
+@pytest.mark.parametrize("n_boards", [3, 4], ids=["by order", "by evidence"])
+def test_a_pencil_of_fifteen_near_parallel_lasers(n_boards: int) -> None:
+    rig = pencil()
+    views = board_views(rig, noise=NOISE)[:n_boards]
     split = assign_lasers(placed(views, board_surface(), rig), LENS, n_lasers=15)
     assert len(split.planes) == 15
     assert sorted(matched(split, rig)) == list(range(15))
+    errors = [laser_error(p, rig.lasers[i].plane)[0] for i, p in enumerate(_sorted(split, rig))]
+    assert np.rad2deg(max(errors)) < 0.2
+
+
+def _sorted(split: LaserAssignment, rig: Rig) -> list[Plane]:
+    """The split's planes in the order of the rig's lasers."""
+    return [split.planes[i] for i in matched(split, rig)]
+
+
+@pytest.mark.parametrize(("n_boards", "n_told"), [(2, 15), (3, 14), (3, 16), (3, None)])
+def test_the_order_of_stripes_needs_three_boards_that_show_all_of_them(
+    n_boards: int, n_told: int | None
+) -> None:
+    rig = pencil()
+    views = board_views(rig, noise=NOISE)[:n_boards]
+    split = assign_lasers(placed(views, board_surface(), rig), LENS, n_lasers=n_told)
+    assert len(split.planes) < 14
+
+
+def test_the_order_of_stripes_does_not_mislead_where_one_of_them_is_missing() -> None:
+    """In one picture the first laser is hidden, in another one the last."""
+    rig, rng = pencil(), range(3)
+    some = [rig.lasers[1:], rig.lasers[:-1], rig.lasers]
+    views = [
+        board_views(replace(rig, lasers=lasers), noise=NOISE)[i]
+        for i, lasers in zip(rng, some, strict=True)
+    ]
+    split = assign_lasers(placed(views, board_surface(), rig), LENS, n_lasers=14)
+    assert len(split.planes) < 14
 
 
 def test_a_surface_is_never_taken_for_a_laser() -> None:

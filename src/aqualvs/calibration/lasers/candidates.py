@@ -8,6 +8,7 @@ a-contrario test (Desolneux, Moisan & Morel 2000, doi:10.1023/A:1026593302236) w
 come from the pictures themselves. The number of points does not count.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -316,6 +317,107 @@ def find_candidates(
         found = _collected(pooled, lines, table, planes, accidents, tolerance_px)
         accidental = _accidental(len(lines), planes.pairs, found)
     return found
+
+
+def ordered_candidates(
+    pooled: PooledStripes, lines: Sequence[StripeLine], n_lasers: int, tolerance_px: float
+) -> list[PlaneCandidate]:
+    """Find the planes of lasers whose stripes lie side by side, in one order on every surface.
+
+    Near-parallel stripes meet accidental planes so often that three surfaces are no evidence for a
+    single plane. But if each of them shows as many stripes as lasers shine, their order tells which
+    belong together.
+
+    Parameters
+    ----------
+    pooled, lines, tolerance_px
+        As in `find_candidates`.
+    n_lasers : int
+        Number of lasers that shine.
+
+    Returns
+    -------
+    list of PlaneCandidate
+        As many as lasers; none if there are fewer than three such surfaces, a stripe is farther
+        from its plane than the tolerance, or stripes shifted by one place fit nearly as well.
+    """
+    table = LineTable.of(pooled, lines)
+    of_patches = [
+        mine
+        for patch in np.unique(table.patch)
+        if len(mine := _longest(lines, np.flatnonzero(table.patch == patch), n_lasers))
+    ]
+    # Enough surfaces to test the order; more are not needed.
+    fewest, most = 3, 4
+    same = _same_surfaces([pooled.patch_planes[table.patch[mine[0]]] for mine in of_patches])
+    apart = [
+        mine for mine, others in zip(of_patches, np.tril(same, -1), strict=True) if not others.any()
+    ]
+    if n_lasers < 2 or len(apart) < fewest:
+        return []
+    order = _side_by_side(table, apart[:most])
+    found = [_plane_of_lines(pooled, lines, table, mine) for mine in order.T]
+    error = _rms_px(found)
+    # The assignments by shifted orders that must be worse, and by which factor.
+    clearly_worse = 3.0
+    for shifts in itertools.product((-1, 0, 1), repeat=len(order) - 1):
+        if any(shifts):
+            shifted = _shifted(order, (0, *shifts))
+            rivals = [_plane_of_lines(pooled, lines, table, mine) for mine in shifted.T]
+            if rivals and _rms_px(rivals) < clearly_worse * error:
+                return []
+    return found if max(one.residual_px for one in found) <= tolerance_px else []
+
+
+def _longest(lines: Sequence[StripeLine], mine: IntArray, n: int) -> IntArray:
+    """Return the n longest of some lines if the others are much shorter; else none."""
+    size = np.array([len(lines[int(i)].members) for i in mine])
+    longest = np.argsort(-size, kind="stable")
+    # Largest length of another line, as a share of theirs: a reflection, or part of an edge.
+    much_shorter = 0.5
+    clear = len(mine) == n or (
+        len(mine) > n and size[longest[n]] < much_shorter * size[longest[n - 1]]
+    )
+    return mine[longest[:n]] if clear else mine[:0]
+
+
+def _side_by_side(table: LineTable, of_patches: Sequence[IntArray]) -> IntArray:
+    """Return the lines (P, n) of patches, in their order across the stripes as the lens sees it."""
+    rows, first = [], np.zeros(3)
+    for mine in of_patches:
+        along = table.points[mine, 2] - table.points[mine, 0]
+        along *= np.sign(along @ along[0])[:, None]
+        direction = along.sum(axis=0)
+        first = direction if not first.any() else first
+        direction *= np.copysign(1.0, direction @ first)
+        middle = table.points[mine, 1]
+        across = np.cross(middle.mean(axis=0), direction)
+        rows.append(mine[np.argsort(middle @ across)])
+    return np.stack(rows)
+
+
+def _shifted(order: IntArray, shifts: Sequence[int]) -> IntArray:
+    """Return the lines (P, m) of the places that all patches have after shifts of each."""
+    n = order.shape[1] - (max(shifts) - min(shifts))
+    starts = [shift - min(shifts) for shift in shifts]
+    return np.stack([row[start : start + n] for row, start in zip(order, starts, strict=True)])
+
+
+def _plane_of_lines(
+    pooled: PooledStripes, lines: Sequence[StripeLine], table: LineTable, mine: IntArray
+) -> PlaneCandidate:
+    """Return the plane that some lines lie in, as certain."""
+    normals, offsets = _planes_of_pairs(table, mine[None, :2])
+    plane = Plane(normals[0], float(offsets[0]))
+    members = np.concatenate([lines[int(i)].members for i in mine])
+    for _ in range(_N_PLANE_FITS):
+        plane = fitted_plane(pooled.placed, members, plane)
+    worst = table.worst_px(plane.normal[None], np.array([plane.offset]))[0, mine]
+    return PlaneCandidate(plane, mine, -np.inf, float(np.sqrt(np.mean(worst**2))))
+
+
+def _rms_px(candidates: Sequence[PlaneCandidate]) -> float:
+    return float(np.sqrt(np.mean([one.residual_px**2 for one in candidates])))
 
 
 def _accidental(n_lines: int, pairs: IntArray, found: Sequence[PlaneCandidate]) -> BoolArray:

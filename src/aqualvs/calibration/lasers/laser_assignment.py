@@ -19,6 +19,7 @@ from aqualvs.calibration.lasers.candidates import (
     find_candidates,
     fitted_plane,
     lines_on_patch,
+    ordered_candidates,
     plane_residuals_px,
 )
 from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledStripes
@@ -313,6 +314,11 @@ def assign_lasers(
     lines = _all_lines(pooled)
     found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
     taken = [plane for plane in found if plane.verdict is PlaneVerdict.LASER]
+    if n_lasers is not None and len(taken) < n_lasers:
+        side_by_side = ordered_candidates(pooled, lines, n_lasers, tolerance_px)
+        ordered = judged(pooled, lines, side_by_side, lens_in_dome)
+        if ordered and all(plane.verdict is PlaneVerdict.LASER for plane in ordered):
+            found = taken = ordered
     in_planes = {int(i) for plane in found for i in plane.candidate.lines}
     lonely = [len(line.members) for i, line in enumerate(lines) if i not in in_planes]
     longest = max(lonely, default=0)
