@@ -20,10 +20,10 @@ from aqualvs.scanning.plane_fit import GLOW_SHARE, TWINE_SHARE
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
-from aqualvs.scanning.stripe import StripePeaks, ThresholdOptions, flank_difference
+from aqualvs.scanning.stripe import ThresholdOptions, flank_difference
 from aqualvs.scanning.surfaces import Surface, TargetKind, find_surfaces
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
-from scanning_cases import peaks_of
+from scanning_cases import merged, peaks_of
 from scanning_cases import strands as broken
 from windowed_cases import windowed
 
@@ -313,9 +313,7 @@ def test_stray_peaks_of_a_dark_laser_cross_no_stripe() -> None:
     for axis, stray in peaks_of(replace(rig, lasers=(dark,)), [(wall, spot)]).items():
         assert 3 <= stray.n < 20, stray.n
         wide = stray._replace(width=np.full(stray.n, 400.0))
-        joined = [np.concatenate(columns) for columns in zip(peaks[axis], wide, strict=True)]
-        order = np.lexsort((joined[1], joined[0]))
-        peaks[axis] = StripePeaks(*(column[order] for column in joined))
+        peaks[axis] = merged(peaks[axis], wide)
     assert_posture(Scanner(rig).measure(0, 0.0, peaks).posture, wall)
 
 

@@ -338,7 +338,7 @@ class Scanner:
             surfaces = _with_replaced(choice.surfaces, other)
             changed = choice._replace(surfaces=surfaces, target=other)
             again = self._measure_target(stripes, changed)
-            if not measurement.posture or _is_better(again, measurement):
+            if _is_better(again, measurement):
                 choice, measurement = changed, again
         # The kind of surface that every point lies on.
         points, rows = label_candidates(
@@ -545,8 +545,10 @@ def _as_other_kind(
 
 def _is_better(again: Measurement, before: Measurement) -> bool:
     """Return whether a target is better measured as of the other kind."""
+    if not before.posture:
+        return True
     # A rough wall is no net in folds.
-    if not (again.posture and before.posture) or again.folded:
+    if not again.posture or again.folded:
         return False
     # Ratio of the scatter about a wall to that about the mean plane of what were no folds: 0.1 on
     # overexposed photographs of a wall. Nets in folds, fitted as solid, have 0.4 and more.

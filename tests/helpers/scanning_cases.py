@@ -54,6 +54,13 @@ def lit_stripe(
     return line[shown].astype(np.int64), place[shown]
 
 
+def merged(*parts: StripePeaks) -> StripePeaks:
+    """All peaks of one search direction, in order."""
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    order = np.lexsort((columns[1], columns[0]))
+    return StripePeaks(*(column[order] for column in columns))
+
+
 def peaks_of(
     rig: Rig, targets: Sequence[tuple[Plane, Lit]], noise_px: float = 0.0
 ) -> dict[SearchAxis, StripePeaks]:

@@ -31,6 +31,7 @@ from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.images import read_image
 from laser_cases import laser_error
 from repository import ROOT
+from scanning_cases import merged
 from whole import WHOLE
 
 PICTURES = ("image2", "image5")
@@ -168,14 +169,9 @@ def in_pieces(peaks: StripePeaks, rng: np.random.Generator) -> StripePeaks:
     is_lit = rng.random((peaks.line.max() // piece + 1, 50)) < 0.25
     lit = np.flatnonzero(is_lit[peaks.line // piece, peaks.position.astype(int) // place])
     beside = rng.integers(0, peaks.n, n_specks)
-    rows = np.concatenate([lit, beside])
-    position = peaks.position[rows]
-    position[len(lit) :] += rng.normal(0.0, offset_px, n_specks)
-    height = peaks.height[rows]
-    height[len(lit) :] *= 0.6
-    all_peaks = StripePeaks(*(column[rows] for column in peaks))
-    all_peaks = all_peaks._replace(position=position, height=height)
-    return StripePeaks(*(column[np.lexsort((position, all_peaks.line))] for column in all_peaks))
+    pieces, specks = (StripePeaks(*(column[rows] for column in peaks)) for rows in (lit, beside))
+    position = specks.position + rng.normal(0.0, offset_px, n_specks)
+    return merged(pieces, specks._replace(position=position, height=0.6 * specks.height))
 
 
 def test_pieces_of_three_lines_among_specks_are_no_net_in_folds() -> None:

@@ -23,6 +23,7 @@ from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall, WaterOptics
 from aqualvs.simulation.truth import target_fit, visible_fit
 from net_dives import frame_of
 from quick_pictures import QuickRenderer
+from scanning_cases import merged
 
 SMALL, WIDE, FLAT = "example", "bluerov2", "flat port"
 RIGS = {SMALL: example_rig, WIDE: bluerov2_rig, FLAT: flat_port_rig}
@@ -162,9 +163,7 @@ def test_wide_specks_of_a_rough_wall_are_no_net_before_it() -> None:
             np.ones(n),
             np.zeros(n),
         )
-        both = StripePeaks(*(np.concatenate(pair) for pair in zip(found, added, strict=True)))
-        order = np.lexsort((both.position, both.line))
-        specks[axis] = StripePeaks(*(column[order] for column in both))
+        specks[axis] = merged(found, added)
     posture = scanner.measure(0, 0.0, specks).posture
     assert posture, posture
     assert posture.range == pytest.approx(0.9, rel=1e-3)

@@ -191,6 +191,7 @@ def calibrate_lasers(
             ),
             uncertainty=_camera_uncertainty(before, refine=refine, elsewhere=elsewhere),
         )
+    result = replace(result, warnings=(*_assumed(before), *result.warnings))
     if len(result.lasers) != len(before.lasers):
         result = replace(result, rig=_with_wavelength(result.rig, wavelength_nm))
     solved = _solved_rig(before, result, target)
@@ -199,7 +200,7 @@ def calibrate_lasers(
         uncertainty=result.uncertainty,
         residuals_px={one.name: one.corner_residuals_px for one in result.views},
         left_out={**target.found.missed, **result.left_out},
-        notes=(*target.found.notes, *_assumed(before), *result.warnings),
+        notes=(*target.found.notes, *result.warnings),
         solution=result,
         found=(target.found,),
         n_medium=target.n_medium,
@@ -226,7 +227,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
         refine=request.refine,
         wavelength_nm=request.wavelength_nm,
     )
-    for warning in (*_assumed(before), *done.solution.warnings):
+    for warning in done.solution.warnings:
         echo(f"note: {warning}")
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_laser_text(figures, laser))
@@ -432,7 +433,6 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             ),
         ),
         warnings=(
-            *_assumed(before),
             *result.warnings,
             *(f"{name}: {why}" for name, why in result.left_out.items()),
             *found.remarks,

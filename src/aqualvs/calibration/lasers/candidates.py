@@ -357,16 +357,17 @@ def ordered_candidates(
         return []
     order = _side_by_side(table, apart[:most])
     found = [_plane_of_lines(pooled, lines, table, mine) for mine in order.T]
+    if max(one.residual_px for one in found) > tolerance_px:
+        return []
     error = _rms_px(found)
     # The assignments by shifted orders that must be worse, and by which factor.
     clearly_worse = 3.0
-    for shifts in itertools.product((-1, 0, 1), repeat=len(order) - 1):
-        if any(shifts):
-            shifted = _shifted(order, (0, *shifts))
-            rivals = [_plane_of_lines(pooled, lines, table, mine) for mine in shifted.T]
-            if rivals and _rms_px(rivals) < clearly_worse * error:
-                return []
-    return found if max(one.residual_px for one in found) <= tolerance_px else []
+    for shifts in filter(any, itertools.product((-1, 0, 1), repeat=len(order) - 1)):
+        shifted = _shifted(order, (0, *shifts))
+        rivals = [_plane_of_lines(pooled, lines, table, mine) for mine in shifted.T]
+        if rivals and _rms_px(rivals) < clearly_worse * error:
+            return []
+    return found
 
 
 def _longest(lines: Sequence[StripeLine], mine: IntArray, n: int) -> IntArray:
@@ -375,23 +376,19 @@ def _longest(lines: Sequence[StripeLine], mine: IntArray, n: int) -> IntArray:
     longest = np.argsort(-size, kind="stable")
     # Largest length of another line, as a share of theirs: a reflection, or part of an edge.
     much_shorter = 0.5
-    clear = len(mine) == n or (
-        len(mine) > n and size[longest[n]] < much_shorter * size[longest[n - 1]]
-    )
-    return mine[longest[:n]] if clear else mine[:0]
+    if len(mine) < n or np.any(size[longest[n:]] >= much_shorter * size[longest[n - 1]]):
+        return mine[:0]
+    return mine[longest[:n]]
 
 
 def _side_by_side(table: LineTable, of_patches: Sequence[IntArray]) -> IntArray:
     """Return the lines (P, n) of patches, in their order across the stripes as the lens sees it."""
-    rows, first = [], np.zeros(3)
+    along = table.points[:, 2] - table.points[:, 0]
+    along *= np.sign(along @ along[of_patches[0][0]])[:, None]
+    rows = []
     for mine in of_patches:
-        along = table.points[mine, 2] - table.points[mine, 0]
-        along *= np.sign(along @ along[0])[:, None]
-        direction = along.sum(axis=0)
-        first = direction if not first.any() else first
-        direction *= np.copysign(1.0, direction @ first)
         middle = table.points[mine, 1]
-        across = np.cross(middle.mean(axis=0), direction)
+        across = np.cross(middle.mean(axis=0), along[mine].sum(axis=0))
         rows.append(mine[np.argsort(middle @ across)])
     return np.stack(rows)
 
