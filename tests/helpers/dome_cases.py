@@ -89,18 +89,24 @@ def rail(
     n_views: int = 8,
     noise_px: float = NOISE_PX,
     tilt: float | None = None,
+    shared_tilt: float = 0.0,
     nearest: float = 0.2,
     farthest: float = 0.9,
     rail_sigma: float = 2e-4,
 ) -> Shoot:
-    """Return views of a board moved along a rail; `kind` is what is given of its poses."""
+    """Return views of a board moved along a rail; `kind` is what is given of its poses.
+
+    `tilt` and `shared_tilt`: standard deviations about each axis, of each board and of all.
+    """
     camera, points = rig.in_water(n).camera(), board_points()
     if tilt is None:
         tilt = float(np.deg2rad(0.2)) if kind == "distance" else 0.2
+    carriage = rotation_from_rotvec(rng.normal(0.0, shared_tilt, 3)) if shared_tilt else np.eye(3)
     zero = rng.normal(0.0, rail_sigma)
     views, given, poses = [], [], []
     for i, distance in enumerate(np.linspace(nearest, farthest, n_views)):
-        rotation = rotation_from_rotvec(rng.normal(0.0, tilt, 3)) @ DOME_FROM_CAM_NOMINAL
+        own_tilt = rotation_from_rotvec(rng.normal(0.0, tilt, 3))
+        rotation = own_tilt @ carriage @ DOME_FROM_CAM_NOMINAL
         middle = np.array([rng.normal(0.0, 0.02), distance, rng.normal(0.0, 0.02)])
         pose = SE3(rotation, middle - rotation @ points.mean(axis=0))
         views.append(see(camera, pose, points, rng, name=f"view_{i}", noise_px=noise_px))

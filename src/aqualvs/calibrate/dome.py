@@ -1,5 +1,6 @@
 """`aqualvs calibrate dome`: position of the lens in its dome or behind its flat port."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,6 +67,7 @@ class DomeRequest:
     thickness_tolerance_mm: float = 0.1
     acrylic_tolerance: float = 0.003
     distance_sigma_mm: float = 0.2
+    shared_tilt_sigma_deg: float = 0.0
     refine_intrinsics: bool = True
 
     def __post_init__(self) -> None:
@@ -73,8 +75,9 @@ class DomeRequest:
 
         Raises `OptionError` naming the option and its value.
         """
-        names = ("radius_tolerance_mm", "thickness_tolerance_mm", "acrylic_tolerance")
-        check_options(self, *names, "distance_sigma_mm", least=0.0, wanted="0 or more")
+        tolerances = ("radius_tolerance_mm", "thickness_tolerance_mm", "acrylic_tolerance")
+        sigmas = ("distance_sigma_mm", "shared_tilt_sigma_deg")
+        check_options(self, *tolerances, *sigmas, least=0.0, wanted="0 or more")
 
 
 def calibrate_dome(
@@ -109,7 +112,7 @@ def calibrate_dome(
     water_pictures, water_board, water_poses : optional
         Further pictures, taken in the rig's water; their board, if it is another one; their poses.
     options : DomeOptions, optional
-        Tolerances of the housing and of the distances.
+        Tolerances of the housing, and of the boards' distances and tilt.
 
     Returns
     -------
@@ -170,6 +173,7 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
             thickness_sigma=request.thickness_tolerance_mm / 1e3,
             n_acrylic_sigma=request.acrylic_tolerance,
             distance_sigma=request.distance_sigma_mm / 1e3,
+            shared_tilt_sigma=math.radians(request.shared_tilt_sigma_deg),
             refine_intrinsics=request.refine_intrinsics,
         ),
     )

@@ -154,6 +154,13 @@ def dome(
     distance_sigma_mm: Annotated[
         float, typer.Option(help="Uncertainty of the poses' distances (one sigma).")
     ] = 0.2,
+    shared_tilt_sigma_deg: Annotated[
+        float,
+        typer.Option(
+            help="Uncertainty (one sigma, about each axis) of a tilt that all boards at known "
+            "distances share, as on a carriage that is not square to its rail."
+        ),
+    ] = 0.0,
     refine_intrinsics: Annotated[
         bool,
         typer.Option(
@@ -184,6 +191,7 @@ def dome(
             thickness_tolerance_mm=thickness_tolerance_mm,
             acrylic_tolerance=acrylic_tolerance,
             distance_sigma_mm=distance_sigma_mm,
+            shared_tilt_sigma_deg=shared_tilt_sigma_deg,
             refine_intrinsics=refine_intrinsics,
         ),
         typer.echo,

@@ -70,6 +70,27 @@ def test_normalised_errors_are_normal(kinds: tuple[str, ...], n_runs: int) -> No
     assert np.mean(noise) == pytest.approx(0.1, rel=0.03)
 
 
+def test_a_tilt_that_all_boards_share_is_in_sigma_if_it_is_stated() -> None:
+    shared_tilt = float(np.deg2rad(0.4))
+    stated = replace(QUICK, shared_tilt_sigma=shared_tilt)
+    runs: dict[float, list[dict[str, float]]] = {0.0: [], shared_tilt: []}
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        true = drawn_rig(example_rig(), QUICK, rng)
+        tilt = float(np.deg2rad(0.05))
+        shoot = rail(true, AIR, "distance", rng, n_views=6, tilt=tilt, shared_tilt=shared_tilt)
+        for options in (QUICK, stated):
+            start = guessed(example_rig(), rotation_known=False)
+            found = dome(start, [shoot.as_set(AIR, 0.0, "air")], options, INTRINSICS)
+            errors = normalised_errors(found, true, shoot.poses)
+            runs[options.shared_tilt_sigma].append(errors)
+    turned = ("rotation", "turns of boards")
+    for kind, spread in _spreads(runs[shared_tilt]).items():
+        # As above; the tilt's three components are all that turns scatter by.
+        assert 0.6 < spread < 1.45, kind
+    assert min(_spreads(runs[0.0])[kind] for kind in turned) > 3.0
+
+
 def _spreads(runs: list[dict[str, float]]) -> dict[str, float]:
     """Return the root mean square of normalised errors by kind."""
     by_kind: dict[str, list[float]] = {}

@@ -23,6 +23,7 @@ from aqualvs.calibration.dome.checks import (
     distance_blocks,
     noise_px,
     solved_by_offset,
+    solved_by_shared_tilt,
 )
 from aqualvs.calibration.dome.problem import (
     LENS,
@@ -30,7 +31,6 @@ from aqualvs.calibration.dome.problem import (
     BoardSet,
     DomeOptions,
     DomeProblem,
-    PoseKind,
     check_sets,
     compare_with_bare_lens,
     dome_problem,
@@ -71,7 +71,10 @@ _WORDS = {
 
 
 def findings(
-    problem: DomeProblem, solution: Solution[BundleState], result: DomeCalibration
+    problem: DomeProblem,
+    solution: Solution[BundleState],
+    result: DomeCalibration,
+    shared_tilt_sigma: float,
 ) -> list[str]:
     """Return one sentence for each finding."""
     bundle, uncertainty = problem.bundle, result.uncertainty
@@ -79,7 +82,8 @@ def findings(
     names = () if housing is None else tuple(n for n in _SIZES if n in housing.numbers())
     seen = observability(bundle, solution, uncertainty, names)
     place = _lens(result) if result.rig.flat_port is None else _port(result)
-    lines = [place, _rotation(problem, result), *_dome(names, result, seen), *_unobservable(seen)]
+    rotation = _rotation(problem, result, shared_tilt_sigma)
+    lines = [place, rotation, *_dome(names, result, seen), *_unobservable(seen)]
     lens = observability(bundle, solution, uncertainty, result.rig.lens.parameter_names)
     lines += _intrinsics(problem, result, lens)
     lines += _entangled(result)
@@ -113,7 +117,7 @@ def _port(result: DomeCalibration) -> str:
     )
 
 
-def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
+def _rotation(problem: DomeProblem, result: DomeCalibration, shared_tilt_sigma: float) -> str:
     if not result.rotation_is_solved:
         return (
             "camera rotation: taken from the rig; boards at unknown poses do not determine it"
@@ -125,12 +129,15 @@ def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
         )
     sigma = np.rad2deg([result.uncertainty.sigmas[name] for name in ROTATION])
     sigmas = ", ".join(f"{axis} {value:.4f}" for axis, value in zip("xyz", sigma, strict=True))
-    exact = any(shot.kind is PoseKind.EXACT for shot in problem.shots)
-    source = "boards at known poses" if exact else "most boards standing square to the dome"
-    shared = "" if exact else ", and by a tilt that all these boards share"
-    return (
-        f"camera rotation: from {source}; uncertain by {sigmas} deg about the dome's axes{shared}"
+    found = f"uncertain by {sigmas} deg about the dome's axes"
+    if not problem.axes_are_of_boards:
+        return f"camera rotation: from boards at known poses; {found}"
+    shared = (
+        f"of which a tilt that all these boards share is {np.rad2deg(shared_tilt_sigma):.2g} deg"
+        if shared_tilt_sigma > 0.0
+        else "and by a tilt that all these boards share (--shared-tilt-sigma-deg)"
     )
+    return f"camera rotation: from most boards standing square to the dome; {found}, {shared}"
 
 
 def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:
@@ -297,14 +304,15 @@ def dome(
     n_solved = len(solution.covariance)
     doubts = check_shared_errors(problem, solution, covariance[:n_solved, :n_solved])
     doubts += check_media(problem, solution, sets)
-    # All given distances share an error.
+    # All given distances share an error, and so do the tilts of boards at known distances.
     by_offset = options.distance_offset_sigma * solved_by_offset(problem, solution)
-    covariance[:n_solved, :n_solved] += np.outer(by_offset, by_offset)
+    by_tilt = options.shared_tilt_sigma * solved_by_shared_tilt(problem, solution)
+    covariance[:n_solved, :n_solved] += np.outer(by_offset, by_offset) + by_tilt @ by_tilt.T
     result = _result(problem, solution, sets, names, covariance)
     check_solution(problem, solution, result.uncertainty)
     if options.check_cross_validation:
         result = replace(result, cross_validation=compare_with_bare_lens(problem, solution))
-    words = findings(problem, solution, result)
+    words = findings(problem, solution, result, options.shared_tilt_sigma)
     return replace(result, findings=(*doubts, *words))
 
 

@@ -14,7 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.calibration.dome.problem import BoardSet, DomeProblem, PoseKind, place_names
+from aqualvs.calibration.dome.problem import (
+    LENS,
+    ROTATION,
+    BoardSet,
+    DomeProblem,
+    PoseKind,
+    place_names,
+)
 from aqualvs.calibration.solver.bundle import (
     CORNER_SIGMA_PX,
     CORNERS,
@@ -41,6 +48,7 @@ from aqualvs.calibration.solver.least_squares import (
 )
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import skew
 from aqualvs.optics.rig import RigUncertainty
 from aqualvs.optics.water import N_AIR
 
@@ -314,6 +322,25 @@ def solved_by_offset(problem: DomeProblem, solution: Solution[BundleState]) -> F
     blocks = distance_blocks(problem, solution)
     slopes, _, _ = _slopes(len(solution.covariance), blocks, dict.fromkeys(blocks, 1.0))
     return solution.covariance @ slopes
+
+
+def solved_by_shared_tilt(problem: DomeProblem, solution: Solution[BundleState]) -> FloatArray:
+    """Return the derivative (P, 3) of the solution by a tilt, about each axis, of all boards.
+
+    Camera and boards turn together about the dome's centre; distances along the dome's y axis
+    change by the square of the tilt only. Zero if boards at exactly known poses give the axes.
+    """
+    bundle, state = problem.bundle, solution.state
+    by_tilt = np.zeros((len(solution.covariance), 3))
+    if not problem.axes_are_of_boards:
+        return by_tilt
+    by_tilt[[bundle.free.index(name) for name in ROTATION]] = np.eye(3)
+    by_tilt[[bundle.free.index(name) for name in LENS]] = -skew(state.rig.dome_from_cam.translation)
+    for i, (pose, view) in enumerate(zip(state.poses, bundle.views, strict=True)):
+        columns = bundle.pose_columns(i)
+        by_tilt[columns[:3]] = np.eye(3)
+        by_tilt[columns[3:]] = -skew(pose.apply(view.view.middle))
+    return by_tilt
 
 
 def _shared_error(

@@ -95,6 +95,9 @@ class DomeOptions:
     # Standard deviation, about each axis, of well set up boards at known distances from square to
     # the dome. A minority of boards may be off by any amount.
     tilt_sigma: float = float(np.deg2rad(0.2))
+    # Standard deviation, about each axis, of a tilt that all these boards share, as on a carriage
+    # that is not square to its rail: it turns the dome's axes, and pictures do not show it.
+    shared_tilt_sigma: float = 0.0
     # Whether intrinsics are solved too, with the camera's calibration as their prior. If not, they
     # are held, and their uncertainty is propagated to the result.
     refine_intrinsics: bool = True
@@ -102,6 +105,11 @@ class DomeOptions:
     check_cross_validation: bool = True
 
     def __post_init__(self) -> None:
+        if self.shared_tilt_sigma < 0.0:
+            raise CalibrationError(
+                f"tilt shared by all boards is {np.rad2deg(self.shared_tilt_sigma):g} deg; use 0 "
+                "or more"
+            )
         if self.distance_sigma <= 0.0 or self.tilt_sigma <= 0.0:
             raise CalibrationError(
                 f"distances known to {1e3 * self.distance_sigma:g} mm and boards square to "
@@ -184,6 +192,12 @@ class DomeProblem:
     def rotation_is_solved(self) -> bool:
         """True if known poses of boards determine the camera's rotation."""
         return any(shot.kind is not PoseKind.UNKNOWN for shot in self.shots)
+
+    @property
+    def axes_are_of_boards(self) -> bool:
+        """True if the dome's axes are those of boards standing square to it."""
+        kinds = {shot.kind for shot in self.shots}
+        return PoseKind.DISTANCE in kinds and PoseKind.EXACT not in kinds
 
     @property
     def measured_views(self) -> list[int]:
