@@ -3,8 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from aqualvs.calibration.lasers.laser_assignment import (
+    BENT_TOLERANCE_PX,
+    TOLERANCE_PX,
     JudgedPlane,
     LaserAssignment,
     PlaneVerdict,
@@ -29,11 +32,13 @@ def only(planes: tuple[JudgedPlane, ...]) -> JudgedPlane:
     return planes[0]
 
 
-def with_points(made: Scene, add: FloatArray) -> Scene:
-    """The scene with one more chain, in the same place of every picture."""
-    camera, views = made.rig.camera(), []
+def with_points(made: Scene, *adds: FloatArray, unsteady_px: float = 0.0) -> Scene:
+    """The scene with more chains, in the same places of every picture, but for `unsteady_px`."""
+    camera, views, rng = made.rig.camera(), [], np.random.default_rng(0)
     for view in made.views:
-        stripes = joined(view.stripes, add)
+        stripes = view.stripes
+        for add in adds:
+            stripes = joined(stripes, add + rng.normal(0.0, unsteady_px, 2))
         placed = place_stripes(camera, stripes, view.dome_from_target, board_surface())
         views.append(replace(view, stripes=stripes, placed=placed))
     return replace(made, views=views)
@@ -45,6 +50,22 @@ def test_a_scratch_in_the_picture_is_no_laser() -> None:
     found = split(with_points(made, line))
     assert len(found.planes) == 1
     assert "one place of the picture" in only(found.spare).why
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_edges_behind_a_board_before_a_still_camera_are_no_lasers(seed: int) -> None:
+    """As many straight edges as a room has; some near others lie in planes beside the lens."""
+    made, rng = scene(seed, 0, 10, clutter=QUIET, noise_px=0.1), np.random.default_rng(seed)
+    edges = []
+    for _ in range(30):
+        middle, angle = rng.uniform([60.0, 60.0], [660.0, 510.0]), rng.uniform(0.0, np.pi)
+        way = np.arange(-60.0, 60.0, 2.0)[:, None] * np.array([np.cos(angle), np.sin(angle)])
+        edges.append(middle + way)
+    stripes = pooled(with_points(made, *edges, unsteady_px=1.5).views, board_surface())
+    lens = made.rig.dome_from_cam.translation
+    for n_lasers, tolerance_px in ((None, TOLERANCE_PX), (1, BENT_TOLERANCE_PX)):
+        found = assign_lasers(stripes, lens, n_lasers=n_lasers, tolerance_px=tolerance_px)
+        assert not found.planes
 
 
 def test_light_on_a_wall_behind_is_not_another_laser() -> None:

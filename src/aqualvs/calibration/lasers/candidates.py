@@ -605,12 +605,17 @@ def _on_two_surfaces(pooled: PooledStripes, patches: IntArray) -> bool:
     return not bool(np.all(_same_surfaces([pooled.patch_planes[i] for i in some])))
 
 
-def fitted_plane(placed: PlacedStripes, members: IntArray, start: Plane) -> Plane:
-    """Fit a plane to some of the points, with the weights of the image."""
+def fitted_plane(
+    placed: PlacedStripes, members: IntArray, start: Plane, through: FloatArray | None = None
+) -> Plane:
+    """Fit a plane to some of the points, with the weights of the image.
+
+    `through`: a point (3,) that the plane must contain.
+    """
     points = placed.points_in_dome[members]
     gain = np.abs(placed.by_across[members] @ start.normal)
     weight = 1.0 / np.maximum(gain, 1e-9) ** 2
-    middle = weight @ points / weight.sum()
+    middle = weight @ points / weight.sum() if through is None else through
     offsets = points - middle
     normal = np.linalg.eigh((weight[:, None] * offsets).T @ offsets)[1][:, 0]
     normal = normal if normal @ start.normal > 0.0 else -normal

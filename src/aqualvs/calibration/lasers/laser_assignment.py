@@ -23,7 +23,7 @@ from aqualvs.calibration.lasers.candidates import (
     plane_residuals_px,
 )
 from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledStripes
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
 
@@ -91,15 +91,13 @@ def judged(
     """
     alarms = np.array([c.log_false_alarms for c in candidates])
     n_sure = _n_sure(alarms)
+    stay = _stay_in_picture(pooled, lines, candidates, lens_in_dome)
     seen: list[JudgedPlane] = []
-    # The stripe of a plane nearer to the lens, in metres, stays in one place of the picture: it is
-    # a scratch or an overlaid text.
-    min_baseline = 2e-3
     for i in _by_target(pooled, lines, candidates):
         candidate = candidates[i]
         members = _members(lines, candidate)
         fault = _fault(pooled, candidate, members, seen)
-        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < min_baseline:
+        if stay[i]:
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to distinguish it from chance"
@@ -211,6 +209,37 @@ def _direction(points: FloatArray) -> FloatArray:
     offsets = points - points.mean(axis=0)
     direction: FloatArray = np.linalg.svd(offsets, full_matrices=False)[2][0]
     return direction
+
+
+def _stay_in_picture(
+    pooled: PooledStripes,
+    lines: Sequence[StripeLine],
+    candidates: Sequence[PlaneCandidate],
+    lens_in_dome: FloatArray,
+) -> BoolArray:
+    """Mark planes (C,) whose stripe stays in one place of the picture, near or far.
+
+    It does so if it is a scratch, an overlaid text, or the background of a camera that stands
+    still; then many edges stay, and some of them together lie in a plane near the lens.
+    """
+    # Distance to the lens, in metres, within which no plane is a laser's.
+    min_baseline = 2e-3
+    # Ratio of the residuals from a plane through the lens to those from a stripe's own plane: of
+    # edges that stay, as many as in a background, and from which stripes move before one. In
+    # photographs of a chessboard before a still camera, groups of edges reach 4.3; lasers 24 to 47
+    # mm from the lens have 7 and more, or 2 if uneven boards stand at hardly differing distances.
+    stays, background, moves = 1.2, 3, 5.0
+    near = np.zeros(len(candidates), np.bool_)
+    ratios = np.zeros(len(candidates))
+    for i, candidate in enumerate(candidates):
+        members, plane = _members(lines, candidate), candidate.plane
+        near[i] = abs(float(plane.signed_distance(lens_in_dome))) < min_baseline
+        fixed = fitted_plane(pooled.placed, members, plane, through=lens_in_dome)
+        away = np.abs(plane_residuals_px(pooled.placed, [plane, fixed])[members])
+        own_px, fixed_px = np.median(away, axis=0)
+        ratios[i] = fixed_px / own_px
+    has_background = np.count_nonzero(near | (ratios < stays)) >= background
+    return near | (has_background & (ratios < moves))
 
 
 def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
