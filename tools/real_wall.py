@@ -177,13 +177,20 @@ def _corners(grey: np.ndarray) -> np.ndarray:
     return np.asarray(corners + first.astype(np.float32))
 
 
-def write_video(image: np.ndarray, path: Path, crf: int, n_frames: int = N_FRAMES) -> None:
-    """Write a picture as a short H.264 video, 4:2:0; an odd last row or column is left out."""
+def write_video(image: np.ndarray, path: Path, fmt: str, n_frames: int = N_FRAMES) -> None:
+    """Write a picture as a short video, 4:2:0; an odd last row or column is left out.
+
+    `fmt`: H.264 (crf23) or Motion JPEG (mjpeg24, the quantiser's scale).
+    """
+    codec, pixels, options = "libx264", "yuv420p", {"crf": fmt.removeprefix("crf")}
+    if fmt.startswith("mjpeg"):
+        scale = fmt.removeprefix("mjpeg")
+        codec, pixels, options = "mjpeg", "yuvj420p", {"qmin": scale, "qmax": scale}
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(25))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": str(crf)}
+        stream = container.add_stream(codec, rate=Fraction(25))
+        stream.width, stream.height, stream.pix_fmt = width, height, pixels
+        stream.options = options
         picture = np.ascontiguousarray(image[:height, :width])
         for _ in range(n_frames):
             frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
@@ -193,10 +200,10 @@ def write_video(image: np.ndarray, path: Path, crf: int, n_frames: int = N_FRAME
 
 def make_source(image: np.ndarray, folder: Path, fmt: str) -> Path:
     """Write a picture in a format, once; return what `aqualvs run` is given."""
-    if fmt.startswith("crf"):
-        path = folder / f"{fmt}.mp4"
+    if fmt.startswith(("crf", "mjpeg")):
+        path = folder / f"{fmt}.{'avi' if fmt.startswith('mjpeg') else 'mp4'}"
         if not path.exists():
-            write_video(image, path, int(fmt.removeprefix("crf")))
+            write_video(image, path, fmt)
         return path
     path = folder / fmt
     path.mkdir(exist_ok=True)

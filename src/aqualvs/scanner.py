@@ -21,7 +21,7 @@ from aqualvs.scanning.assignment import (
     inflate_for_rival,
 )
 from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
-from aqualvs.scanning.detection import DetectorOptions, FrameDetector
+from aqualvs.scanning.detection import DetectorOptions, FrameDetector, FramePeaks
 from aqualvs.scanning.labels import label_candidates
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands, search_range
 from aqualvs.scanning.patch import Patch, fitted_patch
@@ -190,24 +190,24 @@ class Scanner:
             )
         return self.scan(frame)[1]
 
-    def scan(self, frame: Frame) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
+    def scan(self, frame: Frame) -> tuple[FramePeaks, Scan]:
         """Return the peaks of a frame as well as what `process` does. Raises as `detect`."""
         peaks = self.detect(frame)
         return self.without_colour(frame, peaks, self.measure(frame.index, frame.time_s, peaks))
 
     def without_colour(
-        self, frame: Frame, peaks: dict[SearchAxis, StripePeaks], scan: Scan
-    ) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
-        """Measure a frame once more from its tallest peaks if its colours leave hardly a stripe.
+        self, frame: Frame, peaks: FramePeaks, scan: Scan
+    ) -> tuple[FramePeaks, Scan]:
+        """Measure a frame once more from its tallest peaks if its colours leave little of them.
 
-        Codecs drop the chroma of short dashes, and in turbid water the glow beside a line is as
-        green as the line; lamps and daylight make more peaks on twine than the lasers, but lower
-        ones.
+        Codecs drop the chroma of short dashes, and at low quality that of most of a line; in turbid
+        water the glow beside a line is as green as the line. Lamps and daylight make more peaks on
+        twine than the lasers, but lower ones.
 
         Parameters
         ----------
         frame : Frame
-        peaks : dict
+        peaks : FramePeaks
             From `detect`.
         scan : Scan
             From `measure` with these peaks.
@@ -215,26 +215,22 @@ class Scanner:
         Returns
         -------
         peaks, scan
-            Of the tallest peaks if they give a posture that is certain without colour; else as
-            given.
+            Of the tallest peaks if they give a posture that is certain without colour, and has many
+            more points than any before; else as given.
         """
-        hardly_any = (
-            Reason.NO_STRIPES,
-            Reason.TOO_FEW_POINTS,
-            Reason.ONE_LASER,
-            Reason.COLLINEAR,
-            Reason.NOT_A_PLANE,
-        )
-        refusal = scan.posture
-        finds_stripes = isinstance(self.options.detector, StripeOptions)
-        if not finds_stripes or refusal or refusal.reason not in hardly_any:
+        if not isinstance(self.options.detector, StripeOptions) or not _may_lack_colour(
+            peaks, scan
+        ):
             return peaks, scan
         by_luma = peaks if frame.chroma is None else self.detect(replace(frame, chroma=None))
         tallest = self._search(frame.index).detector.tallest(by_luma)
         again = self.measure(frame.index, frame.time_s, tallest, has_colour=False)
-        return (tallest, again) if again.posture else (peaks, scan)
+        n_before = scan.posture.n_points if scan.posture else 0
+        many_more = 1.5
+        is_better = again.posture and again.posture.n_points > many_more * n_before
+        return (tallest, again) if is_better else (peaks, scan)
 
-    def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
+    def detect(self, frame: Frame) -> FramePeaks:
         """Find the sub-pixel peaks along the search lines, within the lasers' bands.
 
         Raises
@@ -498,6 +494,23 @@ class Scanner:
             if one is not target and not shares_peaks(one, rival, subsegments)
         ]
         return as_requested_kind([rival, *kept], self.options.target)
+
+
+def _may_lack_colour(peaks: FramePeaks, scan: Scan) -> bool:
+    """Return whether most of the lasers' light may be missing because it has no colour."""
+    hardly_any = (
+        Reason.NO_STRIPES,
+        Reason.TOO_FEW_POINTS,
+        Reason.ONE_LASER,
+        Reason.COLLINEAR,
+        Reason.NOT_A_PLANE,
+    )
+    # Share of the tall peaks that have the lasers' colour. Of photographs of lines on a wall it is
+    # 0.1 to 0.55 if a codec has dropped much of their chroma, else 0.7 and more.
+    little = 0.6
+    refusal = scan.posture if isinstance(scan.posture, Refusal) else None
+    has_little_light = refusal is not None and refusal.reason in hardly_any
+    return has_little_light or peaks.coloured_share < little
 
 
 def _fitted_surface(

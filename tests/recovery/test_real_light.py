@@ -228,6 +228,21 @@ def found_board(image: np.ndarray, picture: str) -> View:
     return found
 
 
+@pytest.mark.parametrize(
+    ("scale", "light"), [(16, 0.8), (20, 1.0), (20, 0.8), (24, 1.0), (28, 1.0)]
+)
+def test_lines_whose_chroma_is_quantised_away_are_no_net(tmp_path, scale: int, light: float):
+    """Motion JPEG as encoders write it by default keeps the colour of a tenth of these lines."""
+    dimmed = np.asarray(light * photograph("image5"), np.uint8)
+    coded, plain = (
+        measured_as(fmt, dimmed, "image5", tmp_path / fmt) for fmt in (f"mjpeg{scale}", "png")
+    )
+    assert_on_board(coded)
+    assert abs(coded.range_error_mm - plain.range_error_mm) < 1.0
+    assert abs(coded.yaw_error_deg - plain.yaw_error_deg) < 0.2
+    assert abs(coded.pitch_error_deg - plain.pitch_error_deg) < 0.2
+
+
 @pytest.mark.parametrize("light", [lamp, shadow, flicker])
 @pytest.mark.parametrize("picture", PICTURES)
 def test_the_board_is_found_in_uneven_light(picture: str, light) -> None:

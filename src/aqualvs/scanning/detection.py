@@ -207,6 +207,19 @@ def detector_word(options: DetectorOptions) -> str:
     return next(word for word, kind in DETECTORS.items() if isinstance(options, kind))
 
 
+class FramePeaks(dict[SearchAxis, StripePeaks]):
+    """Stripe peaks of a frame by search direction.
+
+    Attributes
+    ----------
+    coloured_share : float
+        Of all peaks that are as tall as the median of these, the share that is among these: 1 if
+        none was left out for its colour.
+    """
+
+    coloured_share = 1.0
+
+
 class FrameDetector:
     """Detector of stripes in frames of one size, within the bands of all lasers.
 
@@ -293,7 +306,7 @@ class FrameDetector:
             np.array([colour.value for colour in self._colours]),
         )
 
-    def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
+    def detect(self, frame: Frame) -> FramePeaks:
         """Find the peaks of every search direction.
 
         Parameters
@@ -303,7 +316,7 @@ class FrameDetector:
 
         Returns
         -------
-        dict of SearchAxis to StripePeaks
+        FramePeaks
             Copies: they stay valid after the next call.
 
         Raises
@@ -323,20 +336,20 @@ class FrameDetector:
                 f"{self._size_px[0]} x {self._size_px[1]} px; use the rig of this camera"
             )
         if not self._bands:
-            return {}
+            return FramePeaks()
         if isinstance(self._options, StripeOptions):
             found = self._find_stripes(frame, self._options)
         else:
             np.copyto(self._luma, frame.luma)
-            found = {
-                axis: detector.detect(self._lines[axis].of(self._luma))
+            found = FramePeaks(
+                (axis, detector.detect(self._lines[axis].of(self._luma)))
                 for axis, detector in self._threshold.items()
-            }
+            )
         if self._field and SearchAxis.ALONG_Y in found:
             found[SearchAxis.ALONG_Y] = _in_picture(found[SearchAxis.ALONG_Y], self._field)
         return found
 
-    def tallest(self, peaks: dict[SearchAxis, StripePeaks]) -> dict[SearchAxis, StripePeaks]:
+    def tallest(self, peaks: FramePeaks) -> FramePeaks:
         """Return the tallest peaks of a frame, fewer than the lasers can make.
 
         Lamps and daylight make many more peaks on twine, but lower ones than the lasers.
@@ -346,12 +359,12 @@ class FrameDetector:
         if most >= len(heights):
             return peaks
         least = np.partition(heights, -most)[-most]
-        return {
-            axis: StripePeaks(*(column[found.height >= least] for column in found))
+        return FramePeaks(
+            (axis, StripePeaks(*(column[found.height >= least] for column in found)))
             for axis, found in peaks.items()
-        }
+        )
 
-    def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, StripePeaks]:
+    def _find_stripes(self, frame: Frame, options: StripeOptions) -> FramePeaks:
         frame = without_neutral_chroma(frame)
         luma, has_colour = self._contrast_image(frame), frame.chroma is not None
         planes = frame.chroma or (_NO_CHROMA, _NO_CHROMA)
@@ -373,8 +386,9 @@ class FrameDetector:
         position, height, width = table[:3].take(rows, axis=1)
         pull = table[PULL].take(rows)
         bounds = np.searchsorted(rows, ends)
-        return {
-            axis: StripePeaks(
+        found = FramePeaks()
+        for axis, start, end in zip(images, bounds[:-1], bounds[1:], strict=True):
+            found[axis] = StripePeaks(
                 line[start:end],
                 position[start:end],
                 height[start:end],
@@ -382,8 +396,11 @@ class FrameDetector:
                 likelihood[start:end],
                 pull[start:end],
             )
-            for axis, start, end in zip(images, bounds[:-1], bounds[1:], strict=True)
-        }
+        if len(rows):
+            tall = lower_quantile(height, 0.5)
+            n_tall = np.count_nonzero(table[HEIGHT] >= tall)
+            found.coloured_share = np.count_nonzero(height >= tall) / n_tall
+        return found
 
     def _contrast_image(self, frame: Frame) -> U8Array:
         """Return the picture in which the lasers have the most contrast.
