@@ -26,6 +26,7 @@ import av
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
+from av.video.stream import VideoStream
 from typer.testing import CliRunner
 
 from aqualvs.cli.main import app
@@ -180,7 +181,7 @@ def _corners(grey: np.ndarray) -> np.ndarray:
 def write_video(image: np.ndarray, path: Path, fmt: str, n_frames: int = N_FRAMES) -> None:
     """Write a picture as a short video, 4:2:0; an odd last row or column is left out.
 
-    `fmt`: H.264 (crf23) or Motion JPEG (mjpeg24, the quantiser's scale).
+    `fmt`: H.264 (crf23) or Motion JPEG (mjpeg24, the scale of its quantiser).
     """
     codec, pixels, options = "libx264", "yuv420p", {"crf": fmt.removeprefix("crf")}
     if fmt.startswith("mjpeg"):
@@ -189,8 +190,9 @@ def write_video(image: np.ndarray, path: Path, fmt: str, n_frames: int = N_FRAME
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=Fraction(25))
+        assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = width, height, pixels
-        stream.options = options
+        stream.options = dict(options)
         picture = np.ascontiguousarray(image[:height, :width])
         for _ in range(n_frames):
             frame = av.VideoFrame.from_ndarray(picture, format="bgr24")

@@ -183,6 +183,34 @@ def test_after_damage_only_pictures_as_they_were_recorded_are_delivered(tmp_path
         np.testing.assert_array_equal(frame.luma, recorded[frame.index])
 
 
+@pytest.mark.parametrize("seed", range(4, 8))
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+def test_of_a_recorded_stream_with_losses_only_sound_pictures_are_delivered(tmp_path, codec, seed):
+    """FFmpeg marks the packets that lack a part, and of their pictures those of H.264 only."""
+    path = write_video(
+        tmp_path / "a.ts",
+        50,
+        size=(192, 128),
+        codec=codec,
+        options={"preset": "veryfast", "g": "10", "x265-params": "log-level=none"},
+        content=lambda i, size: np.roll(grain(0, size), i, axis=1),
+    )
+    with open_source(path) as source:
+        recorded = {round(frame.time_s, 3): frame.luma.copy() for frame in source}
+    datagrams = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 188)
+    of_video = np.flatnonzero((datagrams[:, 1] & 0x1F == 1) & (datagrams[:, 2] == 0))
+    # Nobody marks a first picture that lacks a part.
+    later = of_video[len(of_video) // 4 :]
+    lost = np.random.default_rng(seed).choice(later, 3, replace=False)
+    path.write_bytes(np.delete(datagrams, lost, axis=0).tobytes())
+    frames = []
+    with open_source(path) as source, contextlib.suppress(SourceError):
+        frames += source
+    assert 0 < len(frames) < 50
+    for frame in frames:
+        np.testing.assert_array_equal(frame.luma, recorded[round(frame.time_s, 3)])
+
+
 def test_time_counts_from_the_first_frame_even_if_that_is_lost(tmp_path):
     path = all_key_frames(tmp_path / "a.mp4", 6, size=SMALL)
     destroy_frame(path, 0)

@@ -175,6 +175,9 @@ class VideoSource(Closing):
         # Slice threads leave patched pictures unmarked; frame threads do not wait for each other's
         # patches, so that the following pictures would depend on timing.
         self._stream.codec_context.thread_count = 1
+        if self._stream.codec_context.name == "hevc":
+            # FFmpeg does not mark HEVC pictures that it had to patch up; this drops them instead.
+            self._stream.codec_context.options = {"err_detect": "explode"}
         self.size_px = (self._stream.codec_context.width, self._stream.codec_context.height)
         rate = frame_rate(self._stream)
         self.fps = float(rate) if rate else None
@@ -193,6 +196,7 @@ class VideoSource(Closing):
         # Time of the latest damage, None while pictures are sound; of the key packets since then.
         self._damage: int | None = None
         self._refreshes: list[int] = []
+        self._last_was_corrupt = False
         # Pictures predicted from both sides, until the later side proves sound.
         self._held: deque[Frame] = deque()
         self._is_closed = self._is_at_end = False
@@ -240,7 +244,8 @@ class VideoSource(Closing):
 
     def _distrust(self, time: int) -> None:
         """Wait for a picture that needs no other: something was lost."""
-        self._damage, self._refreshes = time, []
+        self._damage = time if self._damage is None else max(self._damage, time)
+        self._refreshes = []
         self._held.clear()
 
     def _released(self) -> Iterator[Frame]:
@@ -268,7 +273,14 @@ class VideoSource(Closing):
         if packet.is_corrupt and not self._damage_is_partial:
             self._frame_counter.lose(packet)
             return []
-        if packet.is_keyframe and self._damage is not None:
+        # FFmpeg marks H.264 pictures that it had to patch up, but not HEVC's. Of these it marks the
+        # packet that lacks a part, or the one before it, if a parser joins the parts of packets.
+        is_suspect = packet.is_corrupt or self._last_was_corrupt
+        self._last_was_corrupt = packet.is_corrupt
+        if is_suspect:
+            # Even if the packet's own picture claims to need no other.
+            self._distrust((packet.pts or 0) + 1)
+        elif packet.is_keyframe and self._damage is not None:
             self._refreshes.append(packet.pts or 0)
         try:
             pictures = packet.decode()
