@@ -345,8 +345,8 @@ class AssignmentTest:
         Parameters
         ----------
         candidates, subsegments, shapes, surfaces, target
-            As in `may_hide_net`. A solid surface behind a net that shows as many lasers is no other
-            line.
+            As in `may_hide_net`. A solid surface behind a net that shows as many lasers, up to twice
+            as many, is no other line.
         has_colour : bool
             If false, there may be less such light before a net.
 
@@ -359,11 +359,14 @@ class AssignmentTest:
         n_on_target = _n_lasers_on(target, subsegments)
         if n_on_target > _ODDS.may_be_chance:
             return None
-        # Two lasers of many make planes by chance behind the target, too, and more of them meshes.
-        behind, few = np.zeros(subsegments.n, np.bool_), 3
+        # Two lasers of many make planes by chance behind the target, too, and more of them meshes;
+        # and a net shows at least half of the lasers that a wall behind it does.
+        behind, few, half = np.zeros(subsegments.n, np.bool_), 3, 0.5
         for one in surfaces if target.is_mesh else ():
-            shows_all = _n_lasers_on(one, subsegments) >= max(n_on_target, few)
-            if shows_all and not one.is_mesh and _is_nearer(target, one, subsegments):
+            n_behind = _n_lasers_on(one, subsegments)
+            shows_all = n_behind >= max(n_on_target, few)
+            is_behind = not one.is_mesh and _is_nearer(target, one, subsegments)
+            if shows_all and is_behind and n_on_target >= half * n_behind:
                 behind |= one.members
         share: float = other_lines_share(
             candidates, subsegments.of_candidate, target.members, behind, shapes, n_lasers
