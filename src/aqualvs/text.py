@@ -125,8 +125,8 @@ def hole_count(n_holes: int) -> str:
 
 
 def sentence(words: str) -> str:
-    """Return words with a capital letter and a full stop."""
-    return f"{words[:1].upper()}{words[1:]}."
+    """Return words with a capital letter and a full stop, if they do not ask."""
+    return f"{words[:1].upper()}{words[1:]}{'' if words.endswith('?') else '.'}"
 
 
 def signed(text: str) -> str:

@@ -42,7 +42,8 @@ STRIPES = [stripes(i) for i in range(40)]
 
 def scan_of(index, refused):
     one = STRIPES[index % len(STRIPES)]
-    posture = Refusal(Reason.ONE_LASER) if refused else one.posture
+    detail = f"stripes of laser {index}" if index % 3 else ""
+    posture = Refusal(Reason.ONE_LASER, detail) if refused else one.posture
     return Scan(index, index / 25.0, posture, one.points, 1.33)
 
 
@@ -114,3 +115,15 @@ def test_the_net_is_looked_at_in_the_same_frames(tmp_path, monkeypatch):
     whole, parts = of(scans, checked), joined(scans, [7, 8], tmp_path, checked)
     assert parts.net_check.bars == whole.net_check.bars
     assert len(whole.net_check.bars) == 5
+
+
+def test_a_refusal_for_the_commonest_reason_is_told_in_words():
+    found = RunSummary()
+    ambiguous = Refusal(Reason.AMBIGUOUS, "does the rig name all lasers?")
+    for index, posture in enumerate([Refusal(Reason.NO_STRIPES), ambiguous, ambiguous]):
+        found.add(Scan(index, index / 25.0, posture, ScanPoints.none(), 1.33))
+    assert found.lines()[1:] == [
+        "no posture: 2 ambiguous, 1 no_stripes",
+        "  frame 1, ambiguous: does the rig name all lasers?",
+    ]
+    assert found.to_dict()["refused_example"].endswith("does the rig name all lasers?")

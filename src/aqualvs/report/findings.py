@@ -106,7 +106,9 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
         yield f"The run ended with: {run['error']}"
     share = float(track.valid.mean())
     if share < 0.5:
-        yield f"Only {100 * share:.0f} % of the frames gave a posture."
+        example = mapping(run, "summary").get("refused_example")
+        why = f" {sentence(example)}" if isinstance(example, str) else ""
+        yield f"Only {100 * share:.0f} % of the frames gave a posture.{why}"
 
 
 def _summary_text(run: Mapping[str, Any], name: str) -> Iterator[str]:

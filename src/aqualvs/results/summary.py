@@ -216,6 +216,8 @@ class RunSummary:
     """
 
     refused: Counter[str] = field(default_factory=Counter)  # Frames without posture, by reason.
+    # The first of these frames with a detail in words: its index, and the words.
+    examples: dict[str, tuple[int, str]] = field(default_factory=dict)
     # Metres, one for each frame; NaN without a posture.
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
     # Monitor of the lasers, if they are monitored.
@@ -244,12 +246,23 @@ class RunSummary:
         if isinstance(scan.posture, Posture):
             self.ranges.append(scan.posture.range)
         else:
-            self.refuse(scan.posture.reason.value)
+            reason = scan.posture.reason.value
+            self.refuse(reason)
+            if scan.posture.detail:
+                self.examples.setdefault(reason, (scan.index, scan.posture.detail))
 
     def refuse(self, reason: str) -> None:
         """Add a frame without a posture."""
         self.ranges.append(math.nan)
         self.refused[reason] += 1
+
+    def example(self) -> str:
+        """Return a refusal for the commonest reason in words; empty if none has a detail."""
+        for reason, _ in self.refused.most_common(1):
+            if reason in self.examples:
+                index, detail = self.examples[reason]
+                return f"frame {index}, {reason}: {detail}"
+        return ""
 
     def save(self, path: Path) -> None:
         """Write the summary of a part of a dive to a file, in NumPy's npz format.
@@ -260,6 +273,9 @@ class RunSummary:
             "ranges": np.asarray(self.ranges),
             "reasons": np.array(list(self.refused), np.str_),
             "counts": np.array(list(self.refused.values()), np.int64),
+            "example_reasons": np.array(list(self.examples), np.str_),
+            "example_frames": np.array([one for one, _ in self.examples.values()], np.int64),
+            "example_details": np.array([one for _, one in self.examples.values()], np.str_),
         }
         if self.agreement is not None:
             stored |= {_AGREEMENT + key: value for key, value in self.agreement.arrays().items()}
@@ -279,6 +295,9 @@ class RunSummary:
             stored["reasons"].tolist(), stored["counts"].tolist(), strict=True
         ):
             self.refused[reason] += count
+        names = ("example_reasons", "example_frames", "example_details")
+        for reason, index, detail in zip(*(stored[name].tolist() for name in names), strict=True):
+            self.examples.setdefault(reason, (index, detail))
         if self.agreement is not None:
             n = len(_AGREEMENT)
             arrays = {key[n:]: value for key, value in stored.items() if key[:n] == _AGREEMENT}
@@ -300,6 +319,8 @@ class RunSummary:
             found["range_max_m"] = round(max(ranges), 6)
         if self.refused:
             found["refused"] = dict(self.refused.most_common())
+        if example := self.example():
+            found["refused_example"] = example
         if self.agreement is not None:
             found["laser_agreement"] = self.agreement.verdict().to_dict()
         if self.net_check is not None:
@@ -322,6 +343,8 @@ class RunSummary:
         if self.refused:
             counts = (f"{n} {reason}" for reason, n in self.refused.most_common())
             text.append(f"no posture: {', '.join(counts)}")
+        if example := self.example():
+            text.append(f"  {example}")
         sentence = "" if self.agreement is None else self.agreement.verdict().sentence()
         about_net = "" if self.net_check is None else self.net_check.sentence()
         text += [words for words in (sentence, about_net) if words]

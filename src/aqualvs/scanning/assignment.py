@@ -345,8 +345,8 @@ class AssignmentTest:
         Parameters
         ----------
         candidates, subsegments, shapes, surfaces, target
-            As in `may_hide_net`. A solid surface behind a net that shows as many lasers, up to twice
-            as many, is no other line.
+            As in `may_hide_net`. A solid surface behind a net that shows as many lasers, at most
+            twice as many, is no other line.
         has_colour : bool
             If false, there may be less such light before a net.
 

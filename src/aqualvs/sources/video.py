@@ -139,6 +139,9 @@ predict the next ones. Elsewhere it is the torn end of a file; its error would d
 pictures that the decoder still holds."""
 
 
+_STALL_S = 10.0
+"""A stream that sends nothing for this time has ended."""
+
 _MAX_HELD = 16
 """Pictures that H.264 and HEVC can reorder."""
 
@@ -313,6 +316,8 @@ class VideoSource(Closing):
             yield from self._container.demux(self._stream)
         except av.error.InvalidDataError:
             return
+        except av.error.ExitError as fault:
+            raise SourceError(self._broke_off(f"nothing came in {_STALL_S:g} s")) from fault
         except av.error.FFmpegError as fault:
             raise SourceError(self._broke_off(fault.strerror)) from fault
 
@@ -427,16 +432,14 @@ def sampled_pictures(path: Path) -> tuple[list[list[Frame]], Field | None]:
 
 def _open(where: str) -> InputContainer:
     """Open a container, or say in one line why not."""
-    # A stream that sends nothing for this time has ended.
-    stall_s = 10.0
     try:
-        return av.open(where, timeout=stall_s)
+        return av.open(where, timeout=_STALL_S)
     except FileNotFoundError as fault:
         raise SourceError(f"{where}: no such file; check the path") from fault
     except (av.error.InvalidDataError, av.error.EOFError) as fault:
         raise SourceError(_not_a_video(where)) from fault
     except av.error.ExitError as fault:
-        raise SourceError(f"{where}: nothing came in {stall_s:g} s; is the sender on?") from fault
+        raise SourceError(f"{where}: nothing came in {_STALL_S:g} s; is the sender on?") from fault
     except (av.error.FFmpegError, OSError) as fault:
         raise SourceError(f"{where}: cannot be opened ({fault.strerror})") from fault
 
