@@ -396,7 +396,7 @@ class FrameDetector:
                 likelihood[start:end],
                 pull[start:end],
             )
-        if len(rows):
+        if has_colour and len(rows):
             tall = lower_quantile(height, 0.5)
             n_tall = np.count_nonzero(table[HEIGHT] >= tall)
             found.coloured_share = np.count_nonzero(height >= tall) / n_tall

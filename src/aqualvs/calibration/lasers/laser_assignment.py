@@ -224,22 +224,22 @@ def _stay_in_picture(
     """
     # Distance to the lens, in metres, within which no plane is a laser's.
     min_baseline = 2e-3
-    # Ratio of the residuals from a plane through the lens to those from a stripe's own plane: of
+    # Ratios of the residuals from a plane through the lens to those from a stripe's own plane: of
     # edges that stay, as many as in a background, and from which stripes move before one. In
     # photographs of a chessboard before a still camera, groups of edges reach 4.3; lasers 24 to 47
     # mm from the lens have 7 and more, or 2 if uneven boards stand at hardly differing distances.
     stays, background, moves = 1.2, 3, 5.0
     near = np.zeros(len(candidates), np.bool_)
-    ratios = np.zeros(len(candidates))
+    own_px, fixed_px = np.zeros((2, len(candidates)))
     for i, candidate in enumerate(candidates):
         members, plane = _members(lines, candidate), candidate.plane
         near[i] = abs(float(plane.signed_distance(lens_in_dome))) < min_baseline
         fixed = fitted_plane(pooled.placed, members, plane, through=lens_in_dome)
         away = np.abs(plane_residuals_px(pooled.placed, [plane, fixed])[members])
-        own_px, fixed_px = np.median(away, axis=0)
-        ratios[i] = fixed_px / own_px
-    has_background = np.count_nonzero(near | (ratios < stays)) >= background
-    return near | (has_background & (ratios < moves))
+        own_px[i], fixed_px[i] = np.median(away, axis=0)
+    if np.count_nonzero(near | (fixed_px < stays * own_px)) < background:
+        return near
+    return near | (fixed_px < moves * own_px)
 
 
 def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
