@@ -52,12 +52,12 @@ def test_a_scratch_in_the_picture_is_no_laser() -> None:
     assert "one place of the picture" in only(found.spare).why
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_edges_behind_a_board_before_a_still_camera_are_no_lasers(seed: int) -> None:
     """As many straight edges as a room has; some near others lie in planes beside the lens."""
-    made, rng = scene(seed, 0, 10, clutter=QUIET, noise_px=0.1), np.random.default_rng(seed)
+    made, rng = scene(seed, 0, 8, clutter=QUIET, noise_px=0.1), np.random.default_rng(seed)
     edges = []
-    for _ in range(30):
+    for _ in range(24):
         middle, angle = rng.uniform([60.0, 60.0], [660.0, 510.0]), rng.uniform(0.0, np.pi)
         way = np.arange(-60.0, 60.0, 2.0)[:, None] * np.array([np.cos(angle), np.sin(angle)])
         edges.append(middle + way)
