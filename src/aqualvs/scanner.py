@@ -218,9 +218,8 @@ class Scanner:
             Of the tallest peaks if they give a posture that is certain without colour, and has many
             more points than any before; else as given.
         """
-        if not isinstance(self.options.detector, StripeOptions) or not _may_lack_colour(
-            peaks, scan
-        ):
+        finds_stripes = isinstance(self.options.detector, StripeOptions)
+        if not (finds_stripes and _may_lack_colour(peaks, scan)):
             return peaks, scan
         by_luma = peaks if frame.chroma is None else self.detect(replace(frame, chroma=None))
         tallest = self._search(frame.index).detector.tallest(by_luma)
@@ -508,8 +507,7 @@ def _may_lack_colour(peaks: FramePeaks, scan: Scan) -> bool:
     # Share of the tall peaks that have the lasers' colour. Of photographs of lines on a wall it is
     # 0.1 to 0.55 if a codec has dropped much of their chroma, else 0.7 and more.
     little = 0.6
-    refusal = scan.posture if isinstance(scan.posture, Refusal) else None
-    has_little_light = refusal is not None and refusal.reason in hardly_any
+    has_little_light = isinstance(scan.posture, Refusal) and scan.posture.reason in hardly_any
     return has_little_light or peaks.coloured_share < little
 
 

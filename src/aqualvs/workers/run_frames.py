@@ -122,11 +122,11 @@ class Replay(Closing):
             scan = Scan(frame.index, frame.time_s, recorded.refusal, nothing, recorded.n_water)
             return scan, ScanInputs(self.rig, {})
         scanner = self._scanner_in(recorded.n_water)
-        if not self._detects:
-            peaks = recorded.peaks
-            scan = scanner.measure(frame.index, frame.time_s, peaks)
-        else:
+        peaks = recorded.peaks
+        if self._detects:
             peaks, scan = scanner.scan(frame)
+        else:
+            scan = scanner.measure(frame.index, frame.time_s, peaks)
         return replace(scan, turning=recorded.turning), ScanInputs(scanner.rig, peaks)
 
     def _scanner_in(self, n_water: float) -> Scanner:
