@@ -80,7 +80,7 @@ class Fake:
         self.port = 0
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
-        until(lambda: self.port, "a fake vehicle")
+        until(lambda: self.port and self.truths, "a fake vehicle")
 
     @property
     def url(self) -> str:

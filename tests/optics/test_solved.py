@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import Rig, RigUncertainty, rig_parameter_names
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig, RigUncertainty, Window, rig_parameter_names
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.solved import (
     SolvedStep,
@@ -109,6 +110,38 @@ def test_numbers_of_a_laser_that_is_gone_are_left_out() -> None:
     rig = example_rig()
     noted = with_uncertainty(rig, RigUncertainty.independent({"fx": 1.0, "top:offset": 1e-3}))
     assert rig_uncertainty(noted).names == ("fx",)
+
+
+@pytest.mark.parametrize(
+    "window", [None, Window(Plane(np.array([0.0, 0.0, 1.0]), 0.1), np.zeros(3))]
+)
+def test_a_laser_that_is_taken_out_of_the_file_takes_its_numbers_along(
+    tmp_path: Path, window: Window | None
+) -> None:
+    rig = example_rig()
+    first = replace(rig.lasers[0], window=window)
+    rig = replace(rig, lasers=(first, *rig.lasers[1:]))
+    names = rig_parameter_names(rig)
+    root = np.random.default_rng(3).normal(size=(len(names), len(names))) * 1e-4
+    noted = with_uncertainty(rig, RigUncertainty(names, root @ root.T))
+    found = rig_uncertainty(there_and_back(replace(noted, lasers=rig.lasers[1:]), tmp_path))
+    kept = [i for i, name in enumerate(names) if not name.startswith(f"{first.name}:")]
+    assert found.names == tuple(names[i] for i in kept)
+    expected = (root @ root.T)[np.ix_(kept, kept)]
+    np.testing.assert_allclose(found.covariance, expected, rtol=2e-3, atol=1e-11)
+
+
+def test_a_laser_that_is_renamed_is_not_one_taken_out() -> None:
+    rig = example_rig()
+    noted = with_uncertainty(
+        rig,
+        RigUncertainty.independent(
+            dict.fromkeys((f"{laser.name}:offset" for laser in rig.lasers), 1e-3)
+        ),
+    )
+    renamed = replace(rig.lasers[0], name="port")
+    with pytest.raises(RigError, match="which this rig does not have"):
+        rig_uncertainty(replace(noted, lasers=(renamed, *rig.lasers[1:])))
 
 
 def test_steps_are_kept_in_order(tmp_path: Path) -> None:

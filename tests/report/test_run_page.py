@@ -201,7 +201,12 @@ def test_truth_gives_the_errors(dive: Dive) -> None:
     assert "Error against truth, 31 frames" in text
     assert "range, mm 2.00 2.00" in text
     assert "pitch, ° 0.000 0.000" in text
-    assert data_of(page)["error"]["strips"][0]["y"] == pytest.approx([-2.0] * 31, abs=0.01)
+    strip = data_of(page)["error"]["strips"][0]
+    assert strip["y"] == pytest.approx([-2.0] * 31, abs=0.01)
+    # Errors are to be compared with sigmas, which are drawn about zero.
+    low, high = strip["axis"]
+    assert low < -2.0
+    assert high > 0.0
     # Truth is also drawn where there is no posture.
     assert len(data_of(page)["posture"]["strips"][0]["truth"]["x"]) == 40
 
@@ -449,6 +454,7 @@ def test_warnings_say_what_is_wrong(tmp_path: Path) -> None:
     for words in (
         "The run did not finish (status: interrupted)",
         "The run ended with: stopped by hand",
+        "% of the frames gave no posture; the commonest reason: only one laser on the target",
         "No posture for 3.5 s from 6.0 s on: only one laser on the target.",
         "outside the rig's working range of 300–650 mm",
         "Laser “third” gave only 0.0 % of the target points.",

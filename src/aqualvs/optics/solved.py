@@ -33,6 +33,7 @@ from aqualvs.optics.camera import POSE_PARAMETERS
 from aqualvs.optics.rig import (
     DOME_FROM_CAM_NOMINAL,
     LASER_PARAMETERS,
+    LASER_WINDOW_PARAMETERS,
     Rig,
     RigUncertainty,
     rig_parameter_names,
@@ -154,6 +155,8 @@ def is_exact(rig: Rig) -> bool:
 def rig_uncertainty(rig: Rig) -> RigUncertainty:
     """Return the uncertainty written down in a rig; zero for one that is exact or has none.
 
+    The numbers of a laser that was taken out of the rig by hand are left out.
+
     Raises `RigError` with one line, if it is malformed, not a covariance, or of numbers that the
     rig does not have.
     """
@@ -167,9 +170,11 @@ def rig_uncertainty(rig: Rig) -> RigUncertainty:
         raise RigError(
             f"{_PLACE} does not have the keys {', '.join(_KEYS)}; take it out, or calibrate again"
         )
-    names = _names(content["parameters"], rig)
-    sigma = _sigmas(content["sigma"], len(names)) / [_unit(name)[1] for name in names]
-    correlation = _correlation(content["correlation"], len(names))
+    found = _names(content["parameters"], rig)
+    kept = [i for i, name in enumerate(found) if name is not None]
+    names = tuple(name for name in found if name is not None)
+    sigma = _sigmas(content["sigma"], len(found))[kept] / [_unit(name)[1] for name in names]
+    correlation = _correlation(content["correlation"], len(found))[np.ix_(kept, kept)]
     return RigUncertainty(names, correlation * np.outer(sigma, sigma))
 
 
@@ -245,19 +250,38 @@ def _shortened(sigma: FloatArray, correlation: FloatArray) -> tuple[FloatArray, 
     return sigma, correlation
 
 
-def _names(values: object, rig: Rig) -> tuple[str, ...]:
+def _names(values: object, rig: Rig) -> list[str | None]:
+    """Return the names of a file's parameters; None for those of a laser that was taken out."""
     known = {file_parameter_name(name): name for name in rig_parameter_names(rig)}
     if not isinstance(values, list):
         raise RigError(f"{_PLACE}.parameters is not a list; take {_PLACE} out, or calibrate again")
+    removed = _of_removed_lasers(values, rig)
     for i, value in enumerate(values):
         place = f"{_PLACE}.parameters[{i}] is {value!r}"
+        if value in removed:
+            continue
         if not isinstance(value, str) or value not in known:
             close = difflib.get_close_matches(str(value), known, n=1, cutoff=0.5)
             remedy = f"did you mean {close[0]!r}?" if close else f"take {_PLACE} out"
             raise RigError(f"{place}, which this rig does not have; {remedy}")
         if value in values[:i]:
             raise RigError(f"{place} as another one is; name every number once")
-    return tuple(known[value] for value in values)
+    return [known.get(value) for value in values]
+
+
+def _of_removed_lasers(values: list[object], rig: Rig) -> list[object]:
+    """Return those of a file's parameters that are of lasers which the rig does not have.
+
+    None if a laser of the rig has no number among them: then one was renamed, not removed.
+    """
+    every = (*LASER_PARAMETERS, *LASER_WINDOW_PARAMETERS)
+    endings = tuple(f":{file_parameter_name(name)}" for name in every)
+    of_lasers = [one for one in values if isinstance(one, str) and one.endswith(endings)]
+    named = {one.rpartition(":")[0] for one in of_lasers}
+    present = {laser.name for laser in rig.lasers}
+    if not present <= named:
+        return []
+    return [one for one in of_lasers if one.rpartition(":")[0] not in present]
 
 
 def _sigmas(values: object, n: int) -> FloatArray:

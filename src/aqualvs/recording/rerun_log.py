@@ -42,8 +42,6 @@ RRD = ".rrd"
 _TARGET, _VEHICLE, _CAMERA = "target", "target/vehicle", "target/vehicle/camera"
 _PLANE, _PICTURE, _REFUSALS = "target/plane", "target/vehicle/camera/picture", "refusals"
 _SERIES = ("posture/range_m", "posture/pitch_deg", "posture/yaw_deg")
-# Side of the square that represents the target, as a share of its range.
-_SIDE_SHARE = 1.0
 _BLUE, _PALE, _AMBER = (51, 153, 255, 90), (51, 153, 255, 255), (240, 228, 66, 255)
 
 
@@ -175,7 +173,8 @@ class RerunLog(Closing):
         foot = -posture.range * target_from_dome @ normal
         pose = rr.Transform3D(translation=foot, mat3x3=target_from_dome)
         self._stream.log(_VEHICLE, pose)
-        side = _SIDE_SHARE * posture.range
+        # The square that represents the target is as wide as its range.
+        side = posture.range
         plate = rr.Boxes3D(
             half_sizes=[(side / 2, 5e-4, side / 2)], colors=[_BLUE], fill_mode="solid"
         )

@@ -174,10 +174,7 @@ def error_chart(track: Track, truth: FloatArray) -> Json:
     """Return the error of range, pitch and yaw over time, to compare with the stated sigma."""
     scale, unit = time_unit(track)
     error = track.posture - truth
-    strips = [_strip(track, error, None, column, scale) for column in range(3)]
-    for strip in strips:
-        strip["name"] += " error"
-        strip["error"] = True
+    strips = [_strip(track, error, None, column, scale, is_error=True) for column in range(3)]
     span = rounded([track.time_s[0] * scale, track.time_s[-1] * scale], 4)
     return {"time_unit": unit, "measured": "error", "strips": strips, "span": span, "stretches": []}
 
@@ -273,14 +270,20 @@ def _plus_minus(sigma: float, digits: int) -> str:
 
 
 def _strip(
-    track: Track, posture: FloatArray, truth: FloatArray | None, column: int, scale: float
+    track: Track,
+    posture: FloatArray,
+    truth: FloatArray | None,
+    column: int,
+    scale: float,
+    *,
+    is_error: bool = False,
 ) -> Json:
     name, unit, factor, digits, least = _QUANTITIES[column]
     values, sigma = factor * posture[:, column], factor * track.sigma[:, column]
     total = factor * track.sigma_total[:, column]
     rows = thin(values, _PER_LINE)
     strip = {
-        "name": name,
+        "name": f"{name} error" if is_error else name,
         "unit": unit,
         "x": rounded(track.time_s[rows] * scale, 4),
         "y": rounded(values[rows], digits),
@@ -288,20 +291,21 @@ def _strip(
         "total": rounded(total[rows], digits),
         "frame": track.frame[rows].tolist(),
         "breaks": breaks(rows, interruptions(track)),
-        "error": False,
+        "error": is_error,
     }
     true = None if truth is None else factor * truth[:, column]
     if true is not None:
         strip["truth"] = _line(track.time_s * scale, true, thin(true, _PER_LINE), digits)
-    strip["axis"] = _strip_axis(values, total, true, least)
+    # Sigmas of errors are drawn about zero.
+    strip["axis"] = _strip_axis(values, total, np.zeros(1) if is_error else true, least)
     return strip
 
 
 def _strip_axis(
-    values: FloatArray, sigma: FloatArray, truth: FloatArray | None, least: float
+    values: FloatArray, sigma: FloatArray, others: FloatArray | None, least: float
 ) -> list[float]:
-    """Return limits that hold all values; a few huge sigma may stick out."""
-    shown = values if truth is None else np.concatenate([values, truth])
+    """Return limits that hold all values and others; a few huge sigma may stick out."""
+    shown = values if others is None else np.concatenate([values, others])
     shown = shown[np.isfinite(shown)]
     if not len(shown):
         return [0.0, 1.0]

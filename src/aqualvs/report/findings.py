@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.report.charts import stretch_span_s, stretch_text, stretches
+from aqualvs.report.charts import reason_counts, stretch_span_s, stretch_text, stretches
 from aqualvs.report.frames import SampleFrame
 from aqualvs.report.html import Card
 from aqualvs.report.points import PointSummary
@@ -109,6 +109,12 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
         example = mapping(run, "summary").get("refused_example")
         why = f" {sentence(example)}" if isinstance(example, str) else ""
         yield f"Only {100 * share:.0f} % of the frames gave a posture.{why}"
+    elif share < 0.75:
+        reason, count = reason_counts(track)[0]
+        yield (
+            f"{100 * (1.0 - share):.0f} % of the frames gave no posture; the commonest reason: "
+            f"{reason} ({count_text(count, 'frame')})."
+        )
 
 
 def _summary_text(run: Mapping[str, Any], name: str) -> Iterator[str]:

@@ -46,6 +46,7 @@ from aqualvs.live.mavlink.ardusub_parameters import (
     advise_on_station,
 )
 from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
+from aqualvs.live.mavlink.peers import SAFETY_ARMED
 from aqualvs.scanning.scan import GyroRates
 from aqualvs.text import Severity
 from aqualvs.vehicle_logs.tlog import DEPTH_FIELDS, PRESSURE_FIELD, SUB_MODES
@@ -160,7 +161,6 @@ class DepthChoice:
 
 _AUTOPILOT = 1
 _ARDUPILOT, _SUBMARINE, _GROUND_STATION = 3, 12, 6
-_ARMED = 128
 # Two and a half of ArduSub's heartbeats.
 _BEATS_WITHIN_S = 2.5
 # Depth hold only: in other modes the vehicle sinks or rises at neutral sticks, or steers itself.
@@ -311,7 +311,7 @@ class ArduSubLink:
         roll, pitch, heading = attitude_of(self.link)
         return VehicleState(
             heard_s=self._last_heard_s(beat),
-            armed=bool(beat.message.base_mode & _ARMED),
+            armed=bool(beat.message.base_mode & SAFETY_ARMED),
             mode=mode,
             mode_name=mode_name,
             pilot_moves=self._sticks.moved(),

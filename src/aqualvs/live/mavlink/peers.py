@@ -121,6 +121,9 @@ Peer: TypeAlias = tuple[object, ...]
 SILENT_AFTER_S = 5.0
 """A system id silent for this time counts as gone, and may be heard from another address."""
 
+SAFETY_ARMED = 128
+"""Flag of `MAV_MODE_FLAG` in the base mode of a heartbeat: the vehicle is armed."""
+
 # Messages are sent to the vehicle and at most so many others, heard within so many seconds.
 _HEARD_S, _MAX_OTHERS = 10.0, 8
 # Lifetime of a statement about the vehicle's mode: two and a half heartbeats, and the delay of a
@@ -128,7 +131,6 @@ _HEARD_S, _MAX_OTHERS = 10.0, 8
 _CLAIM_LIFETIME_S = 3.0
 _MAX_CLAIMS = 32
 _NO_AUTOPILOT = 8
-_ARMED = 128
 _MAGIC = (0xFD, 0xFE)
 
 
@@ -336,7 +338,7 @@ def _claim(message: Any) -> _Claim:
         message.type,
         message.autopilot,
         message.custom_mode,
-        bool(message.base_mode & _ARMED),
+        bool(message.base_mode & SAFETY_ARMED),
     )
 
 

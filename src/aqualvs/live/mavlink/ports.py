@@ -162,7 +162,9 @@ def _serial_address(text: str, url: str) -> SerialAddress:
     return SerialAddress(match[1], int(match[2] or DEFAULT_BAUD), url)
 
 
-_CHUNK = 4096
+READ_BYTES = 4096
+"""A stream port reads at most so many bytes at once."""
+
 # A stream that accepts no data for this time is broken.
 _STALLED_S = 5.0
 _SEND_BUFFER = 16_384
@@ -457,7 +459,7 @@ class _TcpPort(StreamPort):
         self._socket.close()
 
     def _take(self) -> bytes:
-        return self._socket.recv(_CHUNK)
+        return self._socket.recv(READ_BYTES)
 
     def _give(self, data: bytes) -> int:
         return self._socket.send(data)

@@ -7,9 +7,8 @@ import socket
 import threading
 
 from aqualvs.errors import OptionError
-from aqualvs.live.mavlink.ports import SerialAddress, StreamPort
+from aqualvs.live.mavlink.ports import READ_BYTES, SerialAddress, StreamPort
 
-_CHUNK = 4096
 # On Windows, a write that the driver does not take at once is given up after this time.
 _WRITE_S = 0.1
 
@@ -92,11 +91,11 @@ class SerialPort(StreamPort):
         """Pass on what comes until the port is closed or gone."""
         with self._incoming, contextlib.suppress(OSError):
             while not self._closing:
-                size = min(_CHUNK, max(1, self._serial.in_waiting))
+                size = min(READ_BYTES, max(1, self._serial.in_waiting))
                 self._incoming.sendall(self._serial.read(size))
 
     def _take(self) -> bytes:
-        return self._received.recv(_CHUNK)
+        return self._received.recv(READ_BYTES)
 
     def _give(self, data: bytes) -> int:
         # pyserial tries again and again while there is no room.

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 VEHICLE = "vehicle"
 """Axes of REP-103: x forward, y left, z up, as 3D views expect them; origin as `dome`."""
 
-# Side of the square that represents the target, as a share of its range.
-_SIDE_SHARE = 1.0
 _GREEN = {"r": 0.1, "g": 1.0, "b": 0.3, "a": 1.0}
 _BLUE = {"r": 0.2, "g": 0.6, "b": 1.0, "a": 0.25}
 _LINE_PX = 2.0
@@ -105,10 +103,10 @@ def laser_lines(
 
 
 def _target_square(posture: Posture) -> "sdk.CubePrimitive":
-    """Return the target as a thin square about the foot of the perpendicular."""
+    """Return the target as a thin square, as wide as its range, about the perpendicular's foot."""
     from foxglove.messages import Color, CubePrimitive, Vector3
 
-    side = _SIDE_SHARE * posture.range
+    side = posture.range
     foot = posture.range * posture.normal_in_dome
     axes = upright_axes(posture.normal_in_dome)
     return CubePrimitive(
