@@ -73,15 +73,17 @@ clean: ## Remove what these tasks made
 	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Debian's Python comes without the module that puts pip into a new venv; pip outside reaches in.
+# Byte code is made by all processors at once; pip would use one.
+PIP_OPTIONS := --quiet --disable-pip-version-check --no-compile
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "$(PYTHON) is older than 3.11; name a newer one: make PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -m venv --clear $(VENV) >/dev/null 2>&1 || \
 	  $(PYTHON) -m venv --clear --without-pip $(VENV)
 	@if [ -x $(BIN)/pip ]; then \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'; \
+	  $(BIN)/python -m pip install $(PIP_OPTIONS) -e '.[dev]'; \
 	else \
-	  $(PYTHON) -m pip --python $(BIN)/python install --quiet --disable-pip-version-check \
-	    -e '.[dev]'; \
+	  $(PYTHON) -m pip --python $(BIN)/python install $(PIP_OPTIONS) -e '.[dev]'; \
 	fi
+	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib || true
 	@touch $@

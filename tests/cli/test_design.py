@@ -20,6 +20,7 @@ from aqualvs.simulation.scenarios import example_rig, load_scenario
 from browser import open_page
 from net_dives import frame_of
 from shell_cases import rig_file
+from whole import part_of
 
 SMALL = ["--image", "720x576", "--fov-deg", "48", "--dome-mm", "44.25:5.75"]
 SMALL += ["--lens-mm", "0,20,0", "--range-mm", "300:900", "--no-changes"]
@@ -128,7 +129,7 @@ def test_a_rig_that_exists_is_judged_as_it_is_and_tilted_best(tmp_path, capsys):
     assert "19.9" in said  # The lower laser's tilt, asin(0.340) = 19.9 degrees.
 
 
-@pytest.mark.parametrize("near", [0.15, 0.2])
+@pytest.mark.parametrize("near", part_of([0.15, 0.2]))
 def test_the_verdict_on_a_rig_is_not_that_on_its_lasers_tilted_best(near, tmp_path, capsys):
     path = tmp_path / "near.yaml"
     save_rig(replace(example_rig(), working_range=(near, 1.0)), path)

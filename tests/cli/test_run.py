@@ -29,6 +29,7 @@ from shell_cases import (
     wall_picture,
     write_video,
 )
+from whole import part_of
 
 PROGRAM = [sys.executable, "-m", "aqualvs"]
 # The first run on a machine compiles its kernels.
@@ -237,7 +238,7 @@ def n_points_rows(folder):
     return parquet.read_table(folder / "points.parquet").num_rows
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), part_of([(signal.SIGTERM, 143), (signal.SIGINT, 130)]))
 def test_a_stopped_run_is_complete(long_dive, rig, tmp_path, number, code):
     out = tmp_path / "out"
     with under_way(long_dive, rig, out) as process:

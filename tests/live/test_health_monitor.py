@@ -11,6 +11,7 @@ import pytest
 from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture
 from aqualvs.scanning.scan import ImagePlane
 from live_cases import demo_frames
+from whole import part_of
 
 FPS = 25.0
 
@@ -117,7 +118,7 @@ def test_what_an_encoder_improves_in_a_still_is_no_motion() -> None:
     assert all(found[60 + 12 :])
 
 
-@pytest.mark.parametrize(("moving", "n_slices"), [(47, 1), (54, 3), (58, 8)])
+@pytest.mark.parametrize(("moving", "n_slices"), part_of([(47, 1), (54, 3), (58, 8)]))
 def test_a_still_of_few_bits_is_noticed_within_half_a_second(moving: int, n_slices: int) -> None:
     """At 0.3 Mbit/s its changes alone tell it later."""
     live = swinging(moving, 6.0, 4.0)
@@ -133,7 +134,7 @@ def test_a_still_of_few_bits_is_noticed_within_half_a_second(moving: int, n_slic
 
 @pytest.mark.parametrize(
     ("amplitude_px", "period_s", "n_slices"),
-    [(4.0, 2.0, 1), (4.0, 3.0, 1), (4.0, 3.0, 4), (1.5, 4.0, 1)],
+    part_of([(4.0, 2.0, 1), (4.0, 3.0, 1), (4.0, 3.0, 4), (1.5, 4.0, 1)]),
 )
 def test_a_vehicle_that_turns_round_is_live(
     amplitude_px: float, period_s: float, n_slices: int

@@ -20,7 +20,7 @@ from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import LitPoints, visible_fit
 from net_dives import frame_of
 from quick_pictures import QuickRenderer
-from whole import WHOLE
+from whole import WHOLE, part_of
 
 PITCH, YAW = 4.0, -6.0
 NET = Net(bar=0.022, twine=0.002, roll=0.3)
@@ -121,15 +121,17 @@ def test_folds_are_net_and_move_a_posture_little() -> None:
 
 @pytest.mark.parametrize(
     ("direction", "height", "width", "bar"),
-    [
-        (0.2, 0.03, 0.06, 0.022),
-        # One flank's points lie nearly on a line.
-        (0.6, 0.03, 0.06, 0.022),
-        # One laser alone shows a flank.
-        (0.8, 0.024, 0.045, 0.025),
-        # A steep plane holds all strands of one laser, and those of the others beside them.
-        (0.7, 0.03, 0.06, 0.0215),
-    ],
+    part_of(
+        [
+            # One flank's points lie nearly on a line.
+            (0.6, 0.03, 0.06, 0.022),
+            (0.2, 0.03, 0.06, 0.022),
+            # A steep plane holds all strands of one laser, and those of the others beside them.
+            (0.7, 0.03, 0.06, 0.0215),
+            # One laser alone shows a flank.
+            (0.8, 0.024, 0.045, 0.025),
+        ]
+    ),
 )
 def test_a_net_that_is_all_folds_is_measured_by_all_of_its_light(
     direction: float, height: float, width: float, bar: float
@@ -186,7 +188,13 @@ def test_a_flank_with_most_of_the_strands_is_no_sure_posture(seed: int) -> None:
 
 @pytest.mark.parametrize(
     ("direction", "height", "width", "bar", "behind"),
-    [(0.6, 0.035, 0.05, 0.03, 0.3), (2.0, 0.045, 0.07, 0.03, 0.3), (0.3, 0.05, 0.08, 0.035, 0.3)],
+    part_of(
+        [
+            (0.6, 0.035, 0.05, 0.03, 0.3),
+            (2.0, 0.045, 0.07, 0.03, 0.3),
+            (0.3, 0.05, 0.08, 0.035, 0.3),
+        ]
+    ),
 )
 def test_a_wall_is_no_target_where_a_net_before_it_makes_no_plane(
     direction: float, height: float, width: float, bar: float, behind: float

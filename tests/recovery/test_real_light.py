@@ -32,7 +32,7 @@ from aqualvs.sources.images import read_image
 from laser_cases import laser_error
 from repository import ROOT
 from scanning_cases import merged
-from whole import WHOLE
+from whole import WHOLE, part_of
 
 PICTURES = ("image2", "image5")
 PHOTOGRAPHS = ROOT / "tests" / "data" / "real-wall"
@@ -129,8 +129,8 @@ def test_a_monochrome_camera_measures_as_well(tmp_path, fmt: str) -> None:
     assert_on_board(measured_as(fmt, without_colour(photograph(picture)), picture, tmp_path))
 
 
-@pytest.mark.parametrize(("light", "noise"), [(0.5, 4.0), (0.35, 5.0), (0.3, 4.0)])
-@pytest.mark.parametrize("picture", PICTURES)
+@pytest.mark.parametrize(("light", "noise"), part_of([(0.35, 5.0), (0.5, 4.0), (0.3, 4.0)]))
+@pytest.mark.parametrize("picture", part_of(PICTURES))
 def test_lines_that_noise_nearly_hides_are_measured(
     tmp_path, picture: str, light: float, noise: float
 ) -> None:
@@ -143,7 +143,7 @@ def test_lines_that_noise_nearly_hides_are_measured(
 
 
 @pytest.mark.parametrize("fmt", ["png", "crf23"])
-@pytest.mark.parametrize("picture", PICTURES)
+@pytest.mark.parametrize("picture", part_of(PICTURES))
 def test_faint_lines_of_a_quiet_picture_are_measured(tmp_path, picture: str, fmt: str) -> None:
     """As far off in turbid water: 3 to 6 grey levels high, but nothing else is as high."""
     image = photograph(picture)
@@ -228,7 +228,7 @@ def found_board(image: np.ndarray, picture: str) -> View:
     return found
 
 
-@pytest.mark.parametrize(("scale", "light"), [(20, 1.0), (20, 0.8), (24, 1.0), (28, 1.0)])
+@pytest.mark.parametrize(("scale", "light"), part_of([(20, 0.8), (20, 1.0), (28, 1.0), (24, 1.0)]))
 def test_lines_whose_chroma_is_quantised_away_are_no_net(tmp_path, scale: int, light: float):
     """Motion JPEG as encoders write it by default keeps the colour of a tenth of these lines."""
     dimmed = np.asarray(light * photograph("image5"), np.uint8)
@@ -242,7 +242,7 @@ def test_lines_whose_chroma_is_quantised_away_are_no_net(tmp_path, scale: int, l
 
 
 @pytest.mark.parametrize("light", [lamp, shadow, flicker])
-@pytest.mark.parametrize("picture", PICTURES)
+@pytest.mark.parametrize("picture", part_of(PICTURES))
 def test_the_board_is_found_in_uneven_light(picture: str, light) -> None:
     share = light(*np.meshgrid(np.arange(CROP[2]), np.arange(CROP[3])))
     uneven = np.rint(share[..., None] * photograph(picture)).clip(0, 255).astype(np.uint8)
@@ -295,7 +295,7 @@ BLURRED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("blurred", BLURRED.values(), ids=BLURRED.keys())
-@pytest.mark.parametrize("picture", PICTURES)
+@pytest.mark.parametrize("picture", part_of(PICTURES))
 def test_blurred_lines_are_found(tmp_path, picture: str, blurred) -> None:
     """They are some 8 grey levels high and 7 px wide, and as long and coloured as sharp ones."""
     image = photograph(picture)

@@ -12,7 +12,7 @@ from whole import WHOLE
 
 # JPEG lies between the pictures as they are and H.264, and moved ones are like those out of focus.
 SHARP = ("png", "jpg80", "crf23") if WHOLE else ("png", "crf23")
-BLURRED = ("soft-png", "soft-crf23", "moved-png", "moved-crf23") if WHOLE else ("soft-crf23",)
+BLURRED = ("soft-png", "soft-crf23", "moved-png", "moved-crf23") if WHOLE else ()
 FORMATS = SHARP + BLURRED
 # Pairs of ten of which the red line is found; 9, 10 and 9 are reached, and 9, 7, 9 and 9.
 MIN_PAIRS = {"png": 9, "jpg80": 9, "crf23": 8, "soft-crf23": 5}

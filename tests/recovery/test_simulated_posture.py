@@ -24,6 +24,7 @@ from aqualvs.simulation.truth import target_fit, visible_fit
 from net_dives import frame_of
 from quick_pictures import QuickRenderer
 from scanning_cases import merged
+from whole import part_of
 
 SMALL, WIDE, FLAT = "example", "bluerov2", "flat port"
 RIGS = {SMALL: example_rig, WIDE: bluerov2_rig, FLAT: flat_port_rig}
@@ -182,7 +183,7 @@ def test_the_glow_of_the_sheets_in_turbid_water_moves_no_wall() -> None:
     assert abs(error) < 1.3 * np.sqrt(posture.covariance[0, 0])
 
 
-@pytest.mark.parametrize(("name", "t"), NETS)
+@pytest.mark.parametrize(("name", "t"), part_of(NETS))
 def test_a_net(name: str, t: float) -> None:
     shot = shoot(name, t)
     share, pitch, yaw = errors(shot)

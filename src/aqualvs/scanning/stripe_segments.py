@@ -199,7 +199,8 @@ def _peaks(light: Rows, search: LaserBand, width_px: int) -> StripePeaks:
     grey = np.empty((0, 0), np.uint8)
     image = SearchImage(np.rint(light).astype(np.uint8), grey, grey, search.line_px, along_x=False)
     most = _PEAKS_PER_LINE * n_lines
-    line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most))
+    # Part of a larger array, as the scanner's: for another kind the finder is compiled once more.
+    line, table = np.empty(most, np.int64), np.empty((N_MEASURES, most + 1))[:, :most]
     n = finder.find(image, _MIN_CONTRAST, 1, line, table)
     line, table = line[:n], table[:, :n]
     position, height, width = table[POSITION], table[PEAK_HEIGHT], table[PEAK_WIDTH]

@@ -21,6 +21,7 @@ from aqualvs.simulation.vehicle.models import (
 from aqualvs.simulation.vehicle.vehicle import pack_body, pose_of, state_at
 from aqualvs.simulation.vehicle.water_motion import Flow, Tether, WaterMotion, Waves
 from water_cases import coast, water_at
+from whole import part_of
 
 MODELS = pytest.mark.parametrize("model", VEHICLES.values(), ids=VEHICLES)
 STEP = 1.0 / 400.0
@@ -105,7 +106,7 @@ def test_energy_stays_without_drag(seed: int) -> None:
 
 @MODELS
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("force", [-9.0, 1.0, 20.0])
+@pytest.mark.parametrize("force", part_of([-9.0, 1.0, 20.0]))
 def test_terminal_speed_balances_drag(model: VehicleModel, axis: int, force: float) -> None:
     way = np.eye(3)[axis]
     body = pack_body(neutral(model, Thruster((0.0, 0.0, 0.0), tuple(way))))
