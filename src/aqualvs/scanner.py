@@ -375,7 +375,10 @@ class Scanner:
         candidates, subsegments, _, assignment, _ = stripes
         target = choose_target(surfaces, kind, self.rig.working_range)
         while target is not None and len(surfaces) > 1:
-            if not assignment.may_be_exchanged(subsegments, target):
+            if not (
+                assignment.may_be_exchanged(subsegments, target)
+                or assignment.may_be_shifted(subsegments, surfaces, target)
+            ):
                 break
             surfaces = [one for one in surfaces if one is not target]
             target = choose_target(surfaces, kind, self.rig.working_range)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from aqualvs.geometry.planes import Plane, Rays, exchanged_plane
+from aqualvs.geometry.planes import Plane, Rays, exchanged_plane, shifted_plane
 
 COORDINATE = st.floats(-2.0, 2.0)
 VECTOR = st.tuples(COORDINATE, COORDINATE, COORDINATE).map(np.array)
@@ -117,3 +117,25 @@ def test_two_stripes_share_a_plane_with_their_lasers_exchanged_too() -> None:
     assert back is not None
     np.testing.assert_allclose(back.packed(), wall.packed(), atol=1e-12)
     assert exchanged_plane(wall, Plane(wall.normal, 0.0), sheets[0]) is None
+    # The same plane is found without knowledge that two sheets are exchanged.
+    also = shifted_plane(wall, sheets, sheets[::-1])
+    assert also is not None
+    np.testing.assert_allclose(also.packed(), other.packed(), atol=1e-9)
+
+
+def test_stripes_read_as_those_of_the_next_lasers_show_a_nearer_plane() -> None:
+    fan = [Plane.from_normal((1.0, rise, 0.1), 0.1 - 0.02 * rise) for rise in (-0.3, -0.1, 0.1)]
+    wall = Plane.from_normal((0.1, 1.0, -0.2), 1.6)
+    nearer = shifted_plane(wall, fan[1:], fan[:-1])
+    assert nearer is not None
+    assert 0.1 < nearer.offset < 0.5 * wall.offset
+    # Read back, they are on the wall again; sheets read as themselves move nothing.
+    back = shifted_plane(nearer, fan[:-1], fan[1:])
+    same = shifted_plane(wall, fan, fan)
+    assert back is not None
+    assert same is not None
+    np.testing.assert_allclose(back.packed(), wall.packed(), atol=0.02)
+    np.testing.assert_allclose(same.packed(), wall.packed(), atol=1e-9)
+    # One stripe determines no plane.
+    assert shifted_plane(wall, fan[:1], fan[1:2]) is None
+    assert shifted_plane(wall, [*fan[:1], Plane(wall.normal, 0.0)], fan[1:]) is None

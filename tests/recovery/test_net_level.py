@@ -31,17 +31,29 @@ def upright(name: str, side: float, tilt_deg: float) -> Laser:
     return Laser(name, Plane.from_normal((np.cos(tilt), np.sin(tilt), 0.0), side * np.cos(tilt)))
 
 
+def fan(n: int, half_angle_deg: float) -> tuple[Laser, ...]:
+    """Return upright lasers of one emitter, which stand evenly over twice the angle."""
+    angles = np.deg2rad(np.linspace(-half_angle_deg, half_angle_deg, n))
+    emitter = np.array([0.10, 0.0, 0.06])
+    normals = np.column_stack([np.cos(angles), -np.sin(angles) - 0.15, np.full(n, 0.1)])
+    return tuple(
+        Laser(f"line_{i}", Plane.from_normal(normal, float(normal @ emitter)))
+        for i, normal in enumerate(normals)
+    )
+
+
 HIGH = level("high", 0.12, 8.0)
 RIGS = {
     "two": (level("low", -0.15, -14.0), HIGH),
     "three": (level("low", -0.15, -12.0), HIGH, upright("left", -0.14, -14.0)),
 }
 """The level lasers cross 0.7 m ahead, so each may have made the other's stripe."""
+FANS = {"fan": fan(8, 16.0)}
 
 
 @cache
 def equipment(name: str) -> tuple[QuickRenderer, Scanner]:
-    rig = replace(example_rig(), lasers=RIGS[name])
+    rig = replace(example_rig(), lasers=(RIGS | FANS)[name])
     return QuickRenderer(rig, halo_px=31), Scanner(rig)
 
 
@@ -112,6 +124,21 @@ def test_stripes_on_a_wall_out_of_range_are_not_read_as_each_others(
 def test_a_net_is_measured_before_a_wall_out_of_range() -> None:
     net, at, behind = FINE
     posture, true = measure("three", net, at, behind)
+    assert abs(error(posture, true)[0]) < 0.002 * true[0]
+
+
+@pytest.mark.parametrize(
+    ("net", "at", "behind"),
+    [
+        (square(0.0347, 0.0028, -23.9, (0.085, 0.0394)), (0.82, -7.1, 6.0), 0.64),
+        (square(0.0266, 0.0026, -24.7, (0.0169, 0.0513)), (0.8, 3.3, -5.0), 0.61),
+    ],
+)
+def test_stripes_on_a_wall_out_of_range_are_not_read_as_the_next_lasers(
+    net: Net, at: tuple[float, float, float], behind: float
+) -> None:
+    """Read so, they lie on a plane before the net, a fifth too near."""
+    posture, true = measure("fan", net, at, behind)
     assert abs(error(posture, true)[0]) < 0.002 * true[0]
 
 

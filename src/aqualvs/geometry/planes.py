@@ -1,5 +1,6 @@
 """Planes n·X = d, and the rays of a camera in the outer medium that intersect them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,6 +111,41 @@ def exchanged_plane(plane: Plane, first: Plane, second: Plane) -> Plane | None:
     m = first.normal / offsets[0] + second.normal / offsets[1] - plane.normal / offsets[2]
     length = float(np.linalg.norm(m))
     return Plane(m / length, 1.0 / length) if length > 0.0 else None
+
+
+def shifted_plane(plane: Plane, sheets: Sequence[Plane], read_as: Sequence[Plane]) -> Plane | None:
+    """Return the plane that laser stripes show if each is read as that of another sheet.
+
+    A stripe on m·X = 1 by a sheet s·X = 1 is seen along (s - m)·X = 0. These lines of sight meet
+    another sheet t·X = 1 on all planes (t + a (s - m))·X = 1; the plane returned is nearest to one
+    of these for each stripe. For two sheets that are exchanged it is `exchanged_plane`.
+
+    Parameters
+    ----------
+    plane : Plane
+        On which the stripes are.
+    sheets, read_as : sequence of Plane
+        The sheet of each stripe, and that which it is read as; two or more.
+
+    Returns
+    -------
+    Plane or None
+        The offset is positive. None if the plane is not determined or a sheet passes the origin.
+    """
+    if not all(one.offset for one in (plane, *sheets, *read_as)):
+        return None
+    m, *rest = (one.normal / one.offset for one in (plane, *sheets, *read_as))
+    along = np.array(rest[: len(sheets)]) - m
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    # Projections onto what is across each stripe's planes, (N, 3, 3).
+    across = np.eye(3) - along[:, :, None] * along[:, None]
+    normal = across.sum(axis=0)
+    smallest_share = 1e-9
+    if np.linalg.eigvalsh(normal)[0] < smallest_share * len(sheets):
+        return None
+    found = np.linalg.solve(normal, np.einsum("nij,nj->i", across, np.array(rest[len(sheets) :])))
+    length = float(np.linalg.norm(found))
+    return Plane(found / length, 1.0 / length) if length > 0.0 else None
 
 
 def upright_axes(normal: FloatArray) -> FloatArray:

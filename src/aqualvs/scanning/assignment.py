@@ -26,7 +26,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import lazy_kernel
 from aqualvs.geometry.linear_algebra import n_bins
-from aqualvs.geometry.planes import Plane, exchanged_plane
+from aqualvs.geometry.planes import Plane, exchanged_plane, shifted_plane
 from aqualvs.scanning.assignment_kernels import (
     CELL_LINES,
     DARK,
@@ -45,7 +45,7 @@ from aqualvs.scanning.assignment_kernels import (
     two_longest_stripes,
 )
 from aqualvs.scanning.candidates import Candidates, Subsegments
-from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, sample_bands
 from aqualvs.scanning.net_surfaces import inflate_covariance, seen_through
 from aqualvs.scanning.plane_search import MIN_FACING, WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
@@ -172,8 +172,9 @@ class AssignmentTest:
     ) -> None:
         self._searched = searched
         self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.bool_)
-        self._bands = _sample_bands(laser_bands, triangulator)
+        self._bands = sample_bands(laser_bands, triangulator, CELL_LINES)
         self._sheets = [Plane(row[:3], float(row[3])) for row in triangulator.planes]
+        self._fans = [_in_order(self._sheets, self._along_x, axis) for axis in (True, False)]
 
     def is_by_chance(
         self,
@@ -402,6 +403,48 @@ class AssignmentTest:
         is_steep = not target.is_mesh and facing <= _ODDS.steep
         return bool(may_be_lit or is_steep) and self._is_faint(target, subsegments)
 
+    def may_be_shifted(
+        self, subsegments: Subsegments, surfaces: Sequence[Surface], target: Surface
+    ) -> bool:
+        """Return whether a target may be a wall out of the range, read as the next lasers' stripes.
+
+        The wall is seen through a net, which shows as a mesh behind the target: with more lasers,
+        though the target fills much of its stripes. Tuned on rendered nets before rigs of five and
+        eight lasers; in rigs of three, the next laser is too far away.
+
+        Parameters
+        ----------
+        subsegments, surfaces, target
+            As in `is_by_chance`.
+        """
+        laser = subsegments.laser[target.members]
+        beyond = (self._may_be_beyond(target.plane, fan, laser) for fan in self._fans)
+        if not target.is_mesh or not any(beyond):
+            return False
+        visible, _, _, n_shown = self._visibility(target, subsegments)
+        if visible < _ODDS.filled:
+            return False
+        behind = (one for one in surfaces if one.is_mesh and _is_nearer(target, one, subsegments))
+        return any(self._visibility(one, subsegments)[3] > n_shown for one in behind)
+
+    def _may_be_beyond(self, plane: Plane, fan: IntArray, laser: IntArray) -> bool:
+        """Return whether the stripes, read as the next lasers of a fan, show a plane out of range.
+
+        The fan has four lasers or more, in order.
+        """
+        few, farthest = 3, self._searched[1]
+        if len(fan) <= few:
+            return False
+        for one_way in (fan, fan[::-1]):
+            is_lit = np.isin(one_way[:-1], laser)
+            sheets = [self._sheets[i] for i in one_way[:-1][is_lit]]
+            read_as = [self._sheets[i] for i in one_way[1:][is_lit]]
+            other = shifted_plane(plane, sheets, read_as) if len(sheets) > 1 else None
+            may_be_lit = other and farthest <= other.offset <= _ODDS.max_lit * farthest
+            if other is not None and may_be_lit and other.normal[1] >= MIN_FACING:
+                return True
+        return False
+
     def _light_share(
         self,
         candidates: Candidates,
@@ -519,6 +562,14 @@ def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
     return bool(
         sampling_weight[one.members & near].sum() > 0.5 * sampling_weight[one.members].sum()
     )
+
+
+def _in_order(sheets: Sequence[Plane], along_x: BoolArray, axis: bool) -> IntArray:
+    """Return the lasers of one search axis as they follow each other 1 m ahead of the dome."""
+    across = 0 if axis else 2
+    place = [(one.offset - one.normal[1]) / (one.normal[across] or 1.0) for one in sheets]
+    mine = np.flatnonzero(along_x == axis)
+    return mine[np.argsort(np.array(place)[mine], kind="stable")]
 
 
 @lazy_kernel
@@ -645,35 +696,3 @@ def _alike(
 ) -> bool:
     cosine = float(one[:3] @ other[:3])
     return bool(abs(one[3] / other[3] - 1.0) < share and cosine > math.cos(angle))
-
-
-def _sample_bands(laser_bands: Sequence[LaserBand], triangulator: Triangulator) -> FloatArray:
-    """Sample points of each laser's sheet across its band: (n_lasers, cells, samples, 4).
-
-    A point P is stored as (P, 1) / |P|, because (m·P - 1) / |P| is nearly linear across a band. NaN
-    where the laser cannot be seen.
-    """
-    n_cells = max((len(one.lowest) for one in laser_bands), default=0) // CELL_LINES + 1
-    # Samples across a laser's band, between which its stripe on a plane is located.
-    n_samples = 16
-    bands = np.full((len(laser_bands), n_cells, n_samples, 4), np.nan)
-    for i, band in enumerate(laser_bands):
-        lines = np.arange(CELL_LINES // 2, len(band.lowest), CELL_LINES)
-        lines = lines[band.lowest[lines] <= band.highest[lines]]
-        if not len(lines):
-            continue
-        places = np.linspace(band.lowest[lines], band.highest[lines], n_samples, axis=1)
-        middle = (lines + 0.5)[:, None] * band.line_px - 0.5 + band.shift_px
-        across = np.broadcast_to(middle, places.shape)
-        along_x = band.axis is SearchAxis.ALONG_X
-        pixels = np.stack([places, across] if along_x else [across, places], axis=-1)
-        n = places.size
-        found = triangulator.triangulate(
-            np.ascontiguousarray(pixels.reshape(n, 2)), np.full(n, int(along_x)), np.full(n, i)
-        )
-        points = found.points_in_dome
-        share = 1.0 / np.linalg.norm(points, axis=1)
-        packed = np.column_stack([points * share[:, None], share])
-        packed[~found.valid] = np.nan
-        bands[i, lines // CELL_LINES] = packed.reshape(*places.shape, 4)
-    return bands

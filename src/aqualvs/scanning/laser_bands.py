@@ -5,7 +5,7 @@ from the rig. The band replaces the hand-drawn areas of the paper (section 3.1).
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_colour import LaserColour
+from aqualvs.scanning.triangulate import Triangulator
 
 SLOPE_CELL = 8
 """Positions, and search lines, per cell of the slope tables and of the grid that is intersected."""
@@ -241,3 +242,49 @@ def _band_limits(in_band: BoolArray, n_lines: int, length: int) -> tuple[IntArra
     nearest = np.minimum(lowest[cell], lowest[cell + 1])
     farthest = np.maximum(highest[cell], highest[cell + 1])
     return nearest.astype(np.int64), farthest.astype(np.int64)
+
+
+def sample_bands(
+    laser_bands: Sequence[LaserBand], triangulator: Triangulator, cell_lines: int
+) -> FloatArray:
+    """Sample points of each laser's sheet across its band, on one search line of each cell.
+
+    Parameters
+    ----------
+    laser_bands : sequence of LaserBand
+        One for each laser.
+    triangulator : Triangulator
+        Of the same rig.
+    cell_lines : int
+        Search lines per cell.
+
+    Returns
+    -------
+    float array, shape (n_lasers, cells, samples, 4)
+        A point P in `dome` is stored as (P, 1) / |P|, because (m·P - 1) / |P| is nearly linear
+        across a band. NaN where the laser cannot be seen.
+    """
+    n_cells = max((len(one.lowest) for one in laser_bands), default=0) // cell_lines + 1
+    # Samples across a laser's band, between which its stripe on a plane is located.
+    n_samples = 16
+    bands = np.full((len(laser_bands), n_cells, n_samples, 4), np.nan)
+    for i, band in enumerate(laser_bands):
+        lines = np.arange(cell_lines // 2, len(band.lowest), cell_lines)
+        lines = lines[band.lowest[lines] <= band.highest[lines]]
+        if not len(lines):
+            continue
+        places = np.linspace(band.lowest[lines], band.highest[lines], n_samples, axis=1)
+        middle = (lines + 0.5)[:, None] * band.line_px - 0.5 + band.shift_px
+        across = np.broadcast_to(middle, places.shape)
+        along_x = band.axis is SearchAxis.ALONG_X
+        pixels = np.stack([places, across] if along_x else [across, places], axis=-1)
+        n = places.size
+        found = triangulator.triangulate(
+            np.ascontiguousarray(pixels.reshape(n, 2)), np.full(n, int(along_x)), np.full(n, i)
+        )
+        points = found.points_in_dome
+        share = 1.0 / np.linalg.norm(points, axis=1)
+        packed = np.column_stack([points * share[:, None], share])
+        packed[~found.valid] = np.nan
+        bands[i, lines // cell_lines] = packed.reshape(*places.shape, 4)
+    return bands
