@@ -1,6 +1,7 @@
 """Pictures that stand still while time runs on: when they are noticed, and what is none of them."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 
 import av
@@ -8,8 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture
+from agreement_cases import Diver, Target
+from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture, suspects_of
+from aqualvs.optics.rig import rig_moved_by
+from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.scan import ImagePlane
+from aqualvs.simulation.scenarios import example_rig
 from live_cases import demo_frames
 from whole import part_of
 
@@ -180,3 +185,21 @@ def test_another_size_and_a_stream_that_was_away_begin_anew() -> None:
 def test_pictures_smaller_than_a_cell_are_never_frozen() -> None:
     tiny = np.zeros((4, 4), np.uint8)
     assert not any(watched([tiny] * 30))
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "zoom", "lasers"), [(0.0, 1.0, []), (0.4, 1.0, [1]), (0.0, 1.05, [0, 1, 2])]
+)
+def test_lasers_that_are_off_are_named_and_all_under_zoom(
+    turn_deg: float, zoom: float, lasers: list[int]
+) -> None:
+    rig = example_rig()
+    turned = rig_moved_by(rig, ("left:tilt_1",), np.tan(np.deg2rad([turn_deg])))
+    lens = replace(rig.lens, fx=zoom * rig.lens.fx, fy=zoom * rig.lens.fy)
+    diver, agreement = Diver(replace(turned, lens=lens), rig), LaserAgreement(rig)
+    for i in range(8):
+        target = Target(0.45 + 0.05 * i, pitch_deg=8.0 * (-1) ** i)
+        agreement.add(diver.scan(target, index=3 * i))
+    off = suspects_of(agreement)
+    assert list(off) == lasers
+    assert set(off.values()) == ({agreement.verdict().sentence()} if lasers else set())

@@ -9,6 +9,7 @@ import pytest
 from agreement_cases import Diver, Target
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
+from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.solved import with_uncertainty
 from aqualvs.scanning.agreement import (
     N_BINS,
@@ -16,7 +17,9 @@ from aqualvs.scanning.agreement import (
     AgreementVerdict,
     LaserAgreement,
     bin_stripes,
+    fit_zoom,
 )
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
@@ -130,6 +133,65 @@ def test_a_fisheye_that_does_not_fill_its_picture_is_no_bent_target() -> None:
     verdict = verdict_on(wide, scans(turned(wide, 1, 1.0), wide))
     assert verdict.state is AgreementState.DRIFTED
     assert verdict.suspects == (1,)
+
+
+def zoomed(rig: Rig, zoom: float) -> Rig:
+    lens = replace(rig.lens, fx=rig.lens.fx * (1.0 + zoom), fy=rig.lens.fy * (1.0 + zoom))
+    return replace(rig, lens=lens)
+
+
+@pytest.mark.parametrize("rig", [RIG, bluerov2_rig()], ids=lambda rig: rig.name)
+@pytest.mark.parametrize("target", [swinging, still])
+@pytest.mark.parametrize("zoom", [-0.05, 0.03, 0.1])
+def test_a_zoomed_picture_is_no_fault_of_the_lasers(
+    rig: Rig, target: Callable[..., Target], zoom: float
+) -> None:
+    verdict = verdict_on(rig, scans(zoomed(rig, zoom), rig, target))
+    assert verdict.zoom == pytest.approx(zoom, abs=0.01)
+    larger = "larger" if zoom > 0.0 else "smaller"
+    assert f"% {larger} than the rig's camera makes it: set zoom, " in verdict.sentence()
+    assert verdict.state is AgreementState.ZOOMED
+    assert verdict.suspects == ()
+    found = verdict.to_dict()
+    assert found["zoom_percent"] == pytest.approx(100.0 * zoom, abs=1.0)
+    assert found["words"] == verdict.sentence()
+
+
+def test_a_zoom_that_the_calibration_leaves_open_is_no_alarm() -> None:
+    for share, state in ((1e-3, AgreementState.ZOOMED), (1e-2, AgreementState.AGREE)):
+        known = RigUncertainty.independent({"fx": share * RIG.lens.fx})
+        rig = with_uncertainty(RIG, known)
+        assert verdict_on(rig, scans(zoomed(rig, 0.03), rig)).state is state
+    assert verdict_on(RIG, scans(zoomed(RIG, 0.005), RIG)).state is AgreementState.AGREE
+
+
+def test_a_laser_that_may_have_moved_as_a_zoom_moves_it_is_named_beside_the_zoom() -> None:
+    rig = bluerov2_rig()
+    verdict = verdict_on(rig, scans(turned(rig, 0, 0.2), rig))
+    assert verdict.state is AgreementState.DISAGREE
+    assert verdict.suspects == (0,)
+    assert "laser 1 (lower) is off by" in verdict.sentence()
+    assert " or so, or the picture is " in verdict.sentence()
+
+
+def test_the_sigma_of_a_zoom_is_that_of_drawn_rigs() -> None:
+    names = [f"{laser.name}:{tilt}" for laser in RIG.lasers for tilt in ("tilt_1", "tilt_2")]
+    rig = with_uncertainty(RIG, RigUncertainty.independent(dict.fromkeys(names, 1e-3)))
+    agreement, rng, z = LaserAgreement(rig), np.random.default_rng(3), []
+    along_x = np.array([band.axis is SearchAxis.ALONG_X for band in plan_bands(rig, rig.camera())])
+    for _ in range(12):
+        drawn = rig_moved_by(rig, tuple(names), rng.normal(0.0, 1e-3, len(names)))
+        diver = Diver(drawn, rig)
+        middles = []
+        for i in range(0, N_FRAMES, 3):
+            scan = diver.scan(swinging(i), index=i)
+            assert scan.posture
+            m = scan.posture.normal_in_dome / scan.posture.range
+            middles.append(bin_stripes(scan.points, m, along_x.astype(np.int64), rig.size_px))
+        found = fit_zoom(middles, rig.camera(), along_x.astype(np.int64), sheets_of(rig))
+        z.append(found.zoom / agreement.sigma_zoom(found))
+    # Of 12 values, with a probability of 99 %.
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.55
 
 
 def test_of_two_lasers_either_may_have_moved() -> None:

@@ -324,7 +324,7 @@ class DriftWatch:
         while (scan := self._scans.get()) is not None:
             agreement.add(scan)
             if time.monotonic() - judged_s > _VERDICT_EVERY_S:
-                self.off = _suspects_of(agreement)
+                self.off = suspects_of(agreement)
                 judged_s = time.monotonic()
 
 
@@ -338,11 +338,13 @@ def _agreement_of(rig: Rig) -> LaserAgreement | None:
         return None
 
 
-def _suspects_of(agreement: LaserAgreement) -> dict[int, str]:
+def suspects_of(agreement: LaserAgreement) -> dict[int, str]:
+    """Return what is wrong with the lasers that may be off, by their numbers."""
     verdict = agreement.verdict()
-    if verdict.state not in (AgreementState.DRIFTED, AgreementState.DISAGREE):
-        return {}
-    return dict.fromkeys(verdict.suspects, verdict.sentence())
+    # A zoom moves the stripes of all lasers.
+    is_zoomed = verdict.state is AgreementState.ZOOMED
+    suspects = range(agreement.n_lasers) if is_zoomed else verdict.suspects
+    return dict.fromkeys(suspects, verdict.sentence())
 
 
 WINDOW_S = 5.0

@@ -1,17 +1,19 @@
-"""Agreement of the lasers over a dive: detection of a laser whose sheet has moved.
+"""Agreement of the lasers over a dive: detection of a laser that has moved, and of zoom.
 
 The stripes of all lasers on a flat target lie in one plane; the stripe of a laser whose sheet is
 not where the rig says lies beside it. One frame is weak evidence (three lines, each with a shift
 and a turn, have six parameters, of which the target's own plane takes three), but a sheet that has
 moved has done so by the same three parameters in all frames, at every range and angle of the
 target; a bulge of a net or a fish in front of it does not. So each laser in turn is assumed to have
-moved; it is named if that explains all frames and no other laser does.
+moved; it is named if that explains all frames and no other laser does. A picture that is larger
+than the rig's camera makes it (zoom, stabilisation) does so by one factor in all frames.
 
 `bin_stripes` summarises each stripe of a frame by its centroid in a few bins, whatever the labels:
 the points of a laser that has drifted are labelled as clutter or as another surface. `fit_drift`
 fits a plane m·X = 1 to each frame and one step of three parameters (two tilts and a shift) to one
 laser's sheet in all frames; the planes are eliminated from the normal equations (Schur complement),
-and weights are Tukey's. `LaserAgreement` collects the frames and gives the verdict.
+and weights are Tukey's. `fit_zoom` finds the factor instead. `LaserAgreement` collects the frames
+and gives the verdict.
 """
 
 import math
@@ -22,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Rays
@@ -214,6 +217,60 @@ def fit_drift(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) 
     )
 
 
+# Largest zoom either way, and the step of the zooms that are tried first.
+_MAX_ZOOM, _ZOOM_STEP = 0.16, 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class ZoomFit:
+    """Fit of the frames under the hypothesis that the picture is not as large as in the rig."""
+
+    zoom: float  # Size of the picture over the rig's, less 1.
+    cost: float  # As of `DriftFit`.
+    inliers: float
+    # Shape (1 + 3 L, 1 + 3 L): information of a typical frame on the zoom and on the steps of all
+    # lasers.
+    information: FloatArray
+
+
+def fit_zoom(
+    middles: Sequence[FloatArray], camera: Camera, along_x: IntArray, sheets: Sequence[Sheet]
+) -> ZoomFit:
+    """Fit the size of the picture, about its principal point, to all frames.
+
+    Parameters
+    ----------
+    middles : sequence of array, shape (L, K, 2)
+        Bins of the frames from `bin_stripes`, in `image`.
+    camera : Camera
+    along_x : int array, shape (L,)
+        As in `bin_stripes`.
+    sheets : sequence of Sheet
+        One for each laser.
+    """
+    centre = np.array([camera.lens.cx, camera.lens.cy])
+
+    def at(zoom: float) -> SeenStripes:
+        unzoomed = [centre + (middle - centre) / (1.0 + zoom) for middle in middles]
+        return SeenStripes.of(unzoomed, camera, along_x)
+
+    def cost(zoom: float) -> float:
+        return fit_drift(at(zoom), sheets, None).cost
+
+    tried = np.arange(-_MAX_ZOOM, _MAX_ZOOM + 1e-9, _ZOOM_STEP)
+    near = float(tried[np.argmin([cost(zoom) for zoom in tried.tolist()])])
+    step, limits = 1e-3, (near - _ZOOM_STEP, near + _ZOOM_STEP)
+    zoom = float(optimize.minimize_scalar(cost, bounds=limits, options={"xatol": step}).x)
+    fit = fit_drift(at(zoom), sheets, None)
+    on_sheets, beside = (_SheetPoints.of(at(one), sheets) for one in (zoom, zoom + step))
+    planes = _Fit.of(on_sheets, on_sheets.seen.astype(np.float64))
+    by_zoom = np.einsum("fbi,fi->fb", beside.points - on_sheets.points, planes.m) / step
+    by_zoom *= on_sheets.seen & beside.seen
+    slopes = [by_zoom[..., None], _columns_by_laser(planes.slopes(on_sheets))]
+    information, _ = planes.normal_equations(on_sheets, np.concatenate(slopes, axis=-1))
+    return ZoomFit(zoom, fit.cost, fit.inliers, information)
+
+
 def _newton_step(
     fit: "_Fit", on_sheets: "_SheetPoints", laser: int, step: FloatArray
 ) -> FloatArray:
@@ -385,6 +442,8 @@ _MAX_FRAMES = 24
 _MIN_FRAMES = 5
 # Least share of inliers of a hypothesis: flat targets, or a laser that has moved.
 _EXPLAINED = 0.6
+# Least significance of a fault, in sigmas.
+_SIGNIFICANT = 5.0
 # Another laser is excluded if its cost (mean square in sigmas) is higher by this value plus the
 # first share; no laser has moved unless the cost without a move is higher by this value plus the
 # second share.
@@ -398,7 +457,9 @@ class AgreementState(StrEnum):
     DRIFTED = "drifted"
     """One laser has moved, and it is known which."""
     DISAGREE = "disagree"
-    """One laser has moved, but it could be one of several."""
+    """One laser has moved, but it could be one of several, or the picture is zoomed."""
+    ZOOMED = "zoomed"
+    """The picture is larger or smaller than the rig's camera makes it."""
     NOT_FLAT = "not_flat"
     """The targets are not flat enough to say."""
     NOT_CHECKED = "not_checked"
@@ -420,6 +481,8 @@ class AgreementVerdict:
     sigma_angle: float = math.nan
     # Rms distance of its stripe from the targets, as a share of the range; NaN without suspects.
     effect: float = math.nan
+    # Size of the picture over that of the rig's camera, less 1; 0 where it is not in doubt.
+    zoom: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as written to `run.yaml`."""
@@ -429,22 +492,30 @@ class AgreementVerdict:
             found["angle_deg"] = round(math.degrees(self.angle), 3)
             found["sigma_angle_deg"] = round(math.degrees(self.sigma_angle), 3)
             found["off_range_share"] = round(self.effect, 5)
-            found["words"] = self.sentence()
-        return found
+        if self.zoom:
+            found["zoom_percent"] = round(100.0 * self.zoom, 1)
+        words = self.sentence()
+        return found | {"words": words} if words else found
 
     def sentence(self) -> str:
         """Return the fault and its remedy as text; empty if there is none."""
-        if not self.suspects:
+        if not self.suspects and not self.zoom:
             return ""
-        named = [
-            f"laser {i + 1} ({name})" for i, name in zip(self.suspects, self.names, strict=True)
-        ]
-        off = f"off by {math.degrees(self.angle):.2g} deg"
+        size = f"{abs(self.zoom):.1%} {'larger' if self.zoom > 0.0 else 'smaller'}"
+        zoomed = f"the picture is {size} than the rig's camera makes it"
+        settings = "set zoom, stabilisation and field of view as they were for its calibration"
+        if self.state is AgreementState.ZOOMED:
+            return f"{zoomed}: {settings}, or recalibrate with 'aqualvs calibrate camera'"
+        pairs = zip(self.suspects, self.names, strict=True)
+        named = " or ".join(f"laser {i + 1} ({name})" for i, name in pairs)
+        off = f"{named} is off by {math.degrees(self.angle):.2g} deg"
         remedy = "recalibrate with 'aqualvs calibrate lasers'"
         if self.state is AgreementState.DRIFTED:
             share = f"{self.effect:.1%} of the range"
-            return f"{named[0]} is {off} (its stripe lies {share} off the others' plane): {remedy}"
-        return f"the lasers disagree: {' or '.join(named)} is {off} or so: {remedy}"
+            return f"{off} (its stripe lies {share} off the others' plane): {remedy}"
+        if self.zoom:
+            return f"the lasers disagree: {off} or so, or {zoomed}: {settings}, or {remedy}"
+        return f"the lasers disagree: {off} or so: {remedy}"
 
 
 class LaserAgreement:
@@ -468,6 +539,11 @@ class LaserAgreement:
         every = 3
         self._every = every
         self._verdict: AgreementVerdict | None = None
+
+    @property
+    def n_lasers(self) -> int:
+        """Number of lasers of the rig."""
+        return len(self._along_x)
 
     def add(self, scan: Scan) -> None:
         """Add a frame; frames without a posture, and all but a sample of the others, are skipped.
@@ -531,10 +607,18 @@ class LaserAgreement:
             key=lambda one: one.cost,
         )
         best = found[0]
-        if not self._is_significant(best):
-            return _no_alarm(best, n_frames)
+        is_significant = self._is_significant(best)
         if not _is_worse(none, best, _WORSE_SHARE_OF_NONE):
-            return _no_alarm(none, n_frames)
+            return _no_alarm(none if is_significant else best, n_frames)
+        # A zoom moves the stripes of one laser more than the others', so that one seems to be off.
+        zoomed = fit_zoom(middles, self._camera, self._along_x, sheets)
+        zoom = zoomed.zoom if _explains(zoomed, best) else 0.0
+        if zoom and abs(zoom) < _SIGNIFICANT * self.sigma_zoom(zoomed):
+            return AgreementVerdict(AgreementState.AGREE, n_frames)
+        if zoom and (zoomed.cost < best.cost or not is_significant):
+            return AgreementVerdict(AgreementState.ZOOMED, n_frames, zoom=zoom)
+        if not is_significant:
+            return _no_alarm(best, n_frames)
         # A larger turn means a bent target: a laser so far off would show next to nothing.
         unlikely = math.radians(5.0)
         if best.inliers < _EXPLAINED or float(np.linalg.norm(best.step[:2])) > unlikely:
@@ -543,16 +627,19 @@ class LaserAgreement:
         if len(suspects) == len(found) > 2:
             # If each of three lasers or more could have moved, none has: the target is no plane.
             return AgreementVerdict(AgreementState.NOT_FLAT, n_frames)
-        return self._drift_verdict(suspects, n_frames)
+        return self._drift_verdict(suspects, n_frames, zoom)
 
-    def _drift_verdict(self, suspects: list[DriftFit], n_frames: int) -> AgreementVerdict:
-        """Return the verdict that one of the suspects has moved, the likeliest first."""
+    def _drift_verdict(
+        self, suspects: list[DriftFit], n_frames: int, zoom: float
+    ) -> AgreementVerdict:
+        """Return the verdict that one of the suspects has moved, the likeliest first, or a zoom."""
         best = suspects[0]
         numbers = tuple(one.laser for one in suspects if one.laser is not None)
         tilt = best.step[:2]
         angle = float(np.linalg.norm(tilt))
         covariance = self._covariance(best)[:2, :2]
-        state = AgreementState.DRIFTED if len(suspects) == 1 else AgreementState.DISAGREE
+        is_sure = len(suspects) == 1 and not zoom
+        state = AgreementState.DRIFTED if is_sure else AgreementState.DISAGREE
         return AgreementVerdict(
             state=state,
             n_frames=n_frames,
@@ -561,23 +648,34 @@ class LaserAgreement:
             angle=angle,
             sigma_angle=math.sqrt(float(tilt @ covariance @ tilt)) / angle,
             effect=best.effect,
+            zoom=zoom,
         )
+
+    def sigma_zoom(self, found: ZoomFit) -> float:
+        """Return the standard deviation of a zoom by errors of stripes and calibration."""
+        known = self._known.of(["fx", *self._laser_parameters()])
+        known[0] /= self._rig.lens.fx
+        known[:, 0] /= self._rig.lens.fx
+        by_errors = found.information[0] / found.information[0, 0]
+        return math.sqrt(float(1.0 / found.information[0, 0] + by_errors @ known @ by_errors))
 
     def _is_significant(self, found: DriftFit) -> bool:
         """Return whether the step of a laser is significant, and large enough to matter."""
         step = found.step
         sigmas = math.sqrt(float(step @ np.linalg.solve(self._covariance(found), step)))
-        # Least significance in sigmas; least turn in radians, or least effect.
-        significant = 5.0
+        # Least turn in radians, or least effect.
         angle, effect = math.radians(0.15), 0.005
         matters = found.effect > effect or float(np.linalg.norm(step[:2])) > angle
-        return sigmas > significant and matters
+        return sigmas > _SIGNIFICANT and matters
 
     def _covariance(self, found: DriftFit) -> FloatArray:
         """Return the covariance (3, 3) of a step by errors of stripes and calibration."""
-        names = [f"{laser.name}:{name}" for laser in self._rig.lasers for name in LASER_PARAMETERS]
-        by_steps_of_all = found.by_steps_of_all()
-        return found.covariance() + by_steps_of_all @ self._known.of(names) @ by_steps_of_all.T
+        known, by_steps_of_all = self._known.of(self._laser_parameters()), found.by_steps_of_all()
+        return found.covariance() + by_steps_of_all @ known @ by_steps_of_all.T
+
+    def _laser_parameters(self) -> list[str]:
+        """Return the names of the parameters of all lasers' sheets."""
+        return [f"{laser.name}:{name}" for laser in self._rig.lasers for name in LASER_PARAMETERS]
 
 
 def _no_alarm(found: DriftFit, n_frames: int) -> AgreementVerdict:
@@ -586,6 +684,17 @@ def _no_alarm(found: DriftFit, n_frames: int) -> AgreementVerdict:
     return AgreementVerdict(AgreementState.AGREE if flat else AgreementState.NOT_FLAT, n_frames)
 
 
-def _is_worse(one: DriftFit, best: DriftFit, share: float = _WORSE_SHARE) -> bool:
+def _explains(zoomed: ZoomFit, best: DriftFit) -> bool:
+    """Return whether a zoom explains the frames about as well as the best of the lasers."""
+    # Least zoom: one of 3 % moves the range by 0.3 % with lasers like those of the example rig.
+    matters = abs(zoomed.zoom) > 0.01
+    # It is one number, a laser's step three.
+    as_good = not _is_worse(zoomed, best, _WORSE_SHARE_OF_NONE)
+    return matters and as_good and zoomed.inliers >= _EXPLAINED
+
+
+def _is_worse(
+    one: DriftFit | ZoomFit, best: DriftFit | ZoomFit, share: float = _WORSE_SHARE
+) -> bool:
     """Return whether a hypothesis costs clearly more than the best one."""
     return one.cost - best.cost > _WORSE_COST + share * best.cost
