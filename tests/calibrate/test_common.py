@@ -72,13 +72,13 @@ def test_faults_name_file_place_and_value(tmp_path, text, words):
 
 
 def seen(name, image):
-    """Find a target in every picture, at its middle."""
-    return View(name, np.arange(1), np.zeros((1, 3)), np.array([[image.shape[1] / 2, 0.0]]))
+    """Find a target in every picture, at its mean grey."""
+    return View(name, np.arange(1), np.zeros((1, 3)), np.array([[image.mean(), 0.0]]))
 
 
 def test_a_folder_a_pattern_and_an_iterable_are_pictures(tmp_path):
     for i in range(3):
-        cv2.imwrite(str(tmp_path / f"view_{i}.png"), np.zeros((8, 10), np.uint8))
+        cv2.imwrite(str(tmp_path / f"view_{i}.png"), np.full((8, 10), i, np.uint8))
     for pictures in (str(tmp_path), tmp_path, f"{tmp_path}/*.png", tmp_path.glob("*.png")):
         assert len(detect_targets(pictures, seen, "board").views) == 3
 
@@ -95,3 +95,12 @@ def test_a_folder_a_pattern_and_an_iterable_are_pictures(tmp_path):
 def test_an_array_that_is_no_picture_of_8_bits_is_refused(picture, words):
     with pytest.raises(CalibrationError, match=words):
         detect_targets([np.zeros((8, 10), np.uint8), picture], seen, "board")
+
+
+def test_copies_of_a_picture_are_left_out_and_named(tmp_path):
+    for name, grey in (("a", 1), ("b", 2), ("c", 3), ("d", 2)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((8, 10), grey, np.uint8))
+    found = detect_targets(tmp_path, seen, "board")
+    assert [view.name for view in found.views] == ["a.png", "b.png", "c.png"]
+    assert found.missed == {"d.png": "it is a copy of b.png"}
+    assert "d.png: left out, it is a copy of b.png" in found.remarks

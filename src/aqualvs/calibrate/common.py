@@ -383,7 +383,7 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
         ],
         [size for _, size in results],
     )
-    views = [view for view, _ in results]
+    views = _without_copies([view for view, _ in results])
     missed = {name: why for name, why in zip(names, views, strict=True) if isinstance(why, str)}
     found = [
         (one, view) for one, view in zip(pictures, views, strict=True) if isinstance(view, View)
@@ -396,6 +396,22 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
     return DetectedTargets(
         tuple(view for _, view in found), tuple(one for one, _ in found), size_px, missed
     )
+
+
+def _without_copies(views: Sequence[View | str]) -> list[View | str]:
+    """Return the views, each one equal to an earlier one to the bit replaced by the reason.
+
+    Copies of a picture add no evidence, but would make the sigmas smaller.
+    """
+    first: dict[bytes, str] = {}
+    kept: list[View | str] = []
+    for view in views:
+        if isinstance(view, View):
+            other = first.setdefault(view.ids.tobytes() + view.pixels.tobytes(), view.name)
+            kept.append(view if other is view.name else f"it is a copy of {other}")
+        else:
+            kept.append(view)
+    return kept
 
 
 def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTargets:
