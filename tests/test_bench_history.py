@@ -139,7 +139,7 @@ def benchmarks(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
 
 def stand_in(run: Any) -> ModuleType:
     module = ModuleType("stand_in", "What it is about.")
-    module.run = run  # type: ignore[attr-defined]
+    module.run = run
     return module
 
 

@@ -88,11 +88,7 @@ def request(tmp_path: Path, **more: object) -> RunRequest:
     save_rig(RIG, tmp_path / "rig.yaml")
     source = write_video(tmp_path / "dive.mp4", 18, size=RIG.size_px)
     return RunRequest(
-        source=str(source),
-        rig=tmp_path / "rig.yaml",
-        out=tmp_path / "out",
-        report=False,
-        **more,  # type: ignore[arg-type]
+        source=str(source), rig=tmp_path / "rig.yaml", out=tmp_path / "out", report=False, **more
     )
 
 

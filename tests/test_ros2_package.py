@@ -126,13 +126,11 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
             monkeypatch.setitem(sys.modules, f"{package}.msg", module)
         setattr(module, short, message_class(name))
     quality = types.ModuleType("rclpy.qos")
-    quality.QoSProfile = lambda **wishes: wishes  # type: ignore[attr-defined]
-    quality.ReliabilityPolicy = types.SimpleNamespace(  # type: ignore[attr-defined]
+    quality.QoSProfile = lambda **wishes: wishes
+    quality.ReliabilityPolicy = types.SimpleNamespace(
         RELIABLE="reliable", BEST_EFFORT="best effort"
     )
-    quality.DurabilityPolicy = types.SimpleNamespace(  # type: ignore[attr-defined]
-        TRANSIENT_LOCAL="transient local"
-    )
+    quality.DurabilityPolicy = types.SimpleNamespace(TRANSIENT_LOCAL="transient local")
     monkeypatch.setitem(sys.modules, "rclpy.qos", quality)
     replace_rclpy(monkeypatch)
     monkeypatch.syspath_prepend(str(PACKAGE))
@@ -470,7 +468,7 @@ def test_frames_agree_with_the_library(make: Callable[..., Any], sample: LiveSam
     again = STORE.deserialize_cdr(
         STORE.serialize_cdr(moving[0], "tf2_msgs/msg/TFMessage"), "tf2_msgs/msg/TFMessage"
     )
-    (one,) = again.transforms  # type: ignore[attr-defined]
+    (one,) = again.transforms
     assert (one.header.frame_id, one.child_frame_id) == ("aqualvs_dome", "aqualvs_target")
     assert one.transform.translation.x == target.position[0]
     output.close()

@@ -104,7 +104,7 @@ def test_options_that_would_do_nothing_are_refused(arguments, said, refused, tmp
 
 def test_the_help_of_follow_says_which_options_are_for_what():
     told = {"Vehicle:": set(), "Sim:": set(), "Sim,": set()}
-    for parameter in get_command(app).commands["follow"].params:  # type: ignore[attr-defined]
+    for parameter in get_command(app).commands["follow"].params:
         first = (getattr(parameter, "help", None) or "").partition(" ")[0]
         told.get(first, set()).add(parameter.name)
     assert told["Sim:"] | told["Sim,"] == set(OF_A_SIMULATION)

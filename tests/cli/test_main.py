@@ -156,7 +156,7 @@ def test_an_interrupted_command_exits_with_130_and_says_so(place, name, monkeypa
 
 
 def test_an_interrupt_while_llvm_compiles_is_neither_lost_nor_a_fault_of_the_compilation():
-    import llvmlite.binding as llvm  # type: ignore[import-untyped]
+    import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

@@ -168,7 +168,7 @@ def refusal(content: object, tmp_path: Path) -> str:
 def test_faults_are_told_in_one_line(
     content: dict[str, object], tmp_path: Path, part: str, key: str, value: object, words: str
 ) -> None:
-    content[part][key] = value  # type: ignore[index]
+    content[part][key] = value
     assert words in refusal(content, tmp_path)
 
 

@@ -124,7 +124,7 @@ def test_a_leg_without_a_known_bearing_goes_on() -> None:
 
 def survey(**others: object) -> SurveyMission:
     given = {"depths": (2.0, 2.5, 3.0), "sway": 0.2, "leg": LegOptions(time=4.0), **others}
-    return SurveyMission(HOLD, SurveyOptions(**given))  # type: ignore[arg-type]
+    return SurveyMission(HOLD, SurveyOptions(**given))
 
 
 class Sinking:
@@ -208,7 +208,7 @@ class Loop:
 
     def __init__(self, mission: Mission, name: str = "bluerov2", **plant: object) -> None:
         gains = load_gains(name)
-        self.plant = PlanePlant(gains, **plant)  # type: ignore[arg-type]
+        self.plant = PlanePlant(gains, **plant)
         self.pilot = NetPilot(mission, RangeYawController(gains))
         self.decisions: list[Decision] = []
 
@@ -389,8 +389,8 @@ def test_it_stops_before_the_least_range_whatever_the_controller_wants() -> None
     """A controller gone wild pushes forward; the gate brakes in time, from full speed."""
 
     class Wild(RangeYawController):
-        def update(self, *arguments: object, **others: object):  # type: ignore[no-untyped-def]
-            return replace(super().update(*arguments, **others), forward=0.6)  # type: ignore[arg-type]
+        def update(self, *arguments: object, **others: object):
+            return replace(super().update(*arguments, **others), forward=0.6)
 
     gains = load_gains("bluerov2")
     plant, pilot = PlanePlant(gains, distance=1.2), NetPilot(HoldMission(HOLD), Wild(gains))

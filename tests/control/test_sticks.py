@@ -29,7 +29,7 @@ def answered(effort: Effort, own: StickInput) -> tuple[float, float, float, floa
         abs(asked(Effort(**{name: math.copysign(1.0, getattr(effort, name))}))[k])
         for k, name in enumerate(("forward", "right", "down", "yaw"))
     )
-    return tuple(a / b for a, b in zip(parts, full, strict=True))  # type: ignore[return-value]
+    return tuple(a / b for a, b in zip(parts, full, strict=True))
 
 
 @given(

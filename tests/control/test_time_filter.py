@@ -453,4 +453,4 @@ def test_it_survives_any_clock(steps: list[tuple[float, float, bool]]) -> None:
 )
 def test_options_without_sense_are_refused(name: str, value: float) -> None:
     with pytest.raises(OptionError, match=name):
-        PostureFilterOptions(**{name: value})  # type: ignore[arg-type]
+        PostureFilterOptions(**{name: value})

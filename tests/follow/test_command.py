@@ -132,7 +132,7 @@ def test_enter_engages_and_gives_back() -> None:
     told: list[str] = []
     pilot = Switch()
     keys = io.StringIO("\n\n\n")
-    listen(pilot, keys, lambda line: told.append(line)).join(60.0)  # type: ignore[arg-type]
+    listen(pilot, keys, lambda line: told.append(line)).join(60.0)
     assert told == ["pilot: not engaged: the vehicle is disarmed", "engaged", "disengaged"]
     assert not pilot.engaged
 

@@ -50,7 +50,7 @@ class Reports:
 def test_log_has_a_row_for_every_step(tmp_path: Path) -> None:
     pilot = Reports()
     path = tmp_path / "new" / FOLLOW_CSV
-    log = FollowLogOutput(path, pilot)  # type: ignore[arg-type]
+    log = FollowLogOutput(path, pilot)
     samples = demo_samples(4)
     log.send(samples[0])
     for frame, sample in enumerate(samples):

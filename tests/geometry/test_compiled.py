@@ -80,7 +80,7 @@ def run_caller(folder: Path, name: str = "caller.py", *arguments: str) -> list[s
 def test_kernels_round_as_python_does() -> None:
     """Neither sums in another order, nor fused products, nor reciprocals: the bits are the same."""
     a, b = TERMS
-    assert _dot(a, b) == _dot.py_func(a, b)  # type: ignore[attr-defined]
+    assert _dot(a, b) == _dot.py_func(a, b)
     compiled, plain = np.empty(len(a)), np.empty(len(a))
     _quotients(a, compiled)
     for i, one in enumerate(a.tolist()):

@@ -30,7 +30,7 @@ def posture_at(distance: float = 0.6, yaw: float = 0.0, nearest: float | None = 
 
 def state_at(now_s: float, **others: object) -> VehicleState:
     given = {"heard_s": now_s, "armed": True, "mode": Mode.OURS, "depth": 5.0, "heading": 0.0}
-    return VehicleState(**{**given, **others})  # type: ignore[arg-type]
+    return VehicleState(**{**given, **others})
 
 
 @dataclass

@@ -31,7 +31,7 @@ def compile_one_at_a_time() -> None:
         with global_compiler_lock, locked(folder / _name(self)):
             return plain(self, signature)
 
-    Dispatcher.compile = compile_kernel  # type: ignore[method-assign,assignment]
+    Dispatcher.compile = compile_kernel
 
 
 def _name(dispatcher: Any) -> str:

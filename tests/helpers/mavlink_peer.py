@@ -17,7 +17,7 @@ from pymavlink import mavutil
 mavlink = mavutil.mavlink
 
 
-class PtyPeer(mavutil.mavfile):  # type: ignore[misc]
+class PtyPeer(mavutil.mavfile):
     """The far end of a serial line."""
 
     def __init__(self, link: str, **ids: int) -> None:

@@ -59,7 +59,7 @@ def runner(
 ) -> LiveRunner:
     return LiveRunner(
         ScriptedFeed(steps, endless=endless),
-        ScannerProvider(scanner or demo_scanner()),  # type: ignore[arg-type]
+        ScannerProvider(scanner or demo_scanner()),
         outputs,
         # Most of these steps show one picture again and again.
         LiveOptions(keep_every=keep_every, frozen=FrozenOptions() if watches else None),
@@ -199,7 +199,7 @@ class _Waiting:
 
     def scan(self, frame: Frame) -> tuple[object, Scan]:
         peaks = self.detect(frame)
-        return peaks, demo_scanner().measure(frame.index, frame.time_s, peaks)  # type: ignore[arg-type]
+        return peaks, demo_scanner().measure(frame.index, frame.time_s, peaks)
 
 
 def test_a_source_faster_than_the_pipeline_costs_frames_but_no_delay(
@@ -217,7 +217,7 @@ def test_a_source_faster_than_the_pipeline_costs_frames_but_no_delay(
             scanner.let_go.set()
 
     output = Collector()
-    LiveRunner(Fast([]), ScannerProvider(scanner), [output]).run(never)  # type: ignore[arg-type]
+    LiveRunner(Fast([]), ScannerProvider(scanner), [output]).run(never)
     measured = [s for s in output.samples if s.frame is not None]
     assert [s.scan.index for s in measured] == [0, 399]
     assert (measured[-1].health.n_dropped, measured[-1].health.n_lost) == (398, 0)
@@ -287,7 +287,7 @@ class _Stumbling:
 
     def scan(self, frame: Frame) -> tuple[object, Scan]:
         peaks = self.detect(frame)
-        return peaks, demo_scanner().measure(frame.index, frame.time_s, peaks)  # type: ignore[arg-type]
+        return peaks, demo_scanner().measure(frame.index, frame.time_s, peaks)
 
 
 def test_a_frame_that_the_scanner_fails_on_ends_nothing() -> None:

@@ -110,14 +110,14 @@ def passing(
     """Pass a net on a slant from its origin, two steps right for one up."""
     for i in range(first, first + n):
         foot = i * step * np.array([1.0, 0.5]) + [0.0, up]
-        holes.add(NET, view_at(foot, i, **options), -foot, foot, 0)  # type: ignore[arg-type]
+        holes.add(NET, view_at(foot, i, **options), -foot, foot, 0)
     holes.update(NET)
 
 
 def passed(**options: object) -> list[Hole]:
     """Holes found on a pass."""
     holes = HoleMap()
-    passing(holes, **options)  # type: ignore[arg-type]
+    passing(holes, **options)
     return holes.holes
 
 

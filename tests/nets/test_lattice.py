@@ -65,7 +65,7 @@ def frame(
 
 def found_in(seed: int, *net: object, n_frames: int = 12, noise: float = 5e-4) -> NetLattice:
     rng = np.random.default_rng(seed)
-    lattice = find_lattice([frame(rng, *net, noise) for _ in range(n_frames)])  # type: ignore[arg-type, call-arg]
+    lattice = find_lattice([frame(rng, *net, noise) for _ in range(n_frames)])
     assert lattice is not None
     return lattice
 

@@ -263,7 +263,7 @@ def test_impossible_cameras_are_refused(change: dict[str, object], words: str) -
         "n_water": 1.3333,
     }
     with pytest.raises(RigError, match=words):
-        Camera(**(good | change))  # type: ignore[arg-type]
+        Camera(**(good | change))
 
 
 def test_moved_by_follows_the_documented_order() -> None:

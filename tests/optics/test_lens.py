@@ -213,4 +213,4 @@ def test_shapes_follow_the_batch() -> None:
 )
 def test_impossible_lenses_are_refused(change: dict[str, object], words: str) -> None:
     with pytest.raises(RigError, match=words):
-        Lens(**(INTRINSICS | change))  # type: ignore[arg-type]
+        Lens(**(INTRINSICS | change))

@@ -97,7 +97,7 @@ def same(one: Rig, other: Rig, *, rotation_atol: float = 0.0) -> bool:
 def fault(content: object) -> str:
     """Return what is said about a faulty file: one line that begins with the file's name."""
     with pytest.raises(RigError) as caught:
-        rig_from_mapping(content, source_name="my.yaml")  # type: ignore[arg-type]
+        rig_from_mapping(content, source_name="my.yaml")
     message = str(caught.value)
     assert message.startswith("my.yaml: ")
     assert "\n" not in message

@@ -154,7 +154,7 @@ def test_rays_that_see_nothing() -> None:
     # No such ray; one that leads away; one that meets the plane of the light, but in air.
     assert not seen.any()
     assert np.isnan(found).all()
-    found, seen = sheet.intersect(Rays(origins[0], directions[0], np.bool_(True)))  # type: ignore[arg-type]
+    found, seen = sheet.intersect(Rays(origins[0], directions[0], np.bool_(True)))
     assert found.shape == (3,)
     assert seen
 

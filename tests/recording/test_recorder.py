@@ -364,7 +364,7 @@ def disk():
         disks.append(Disk(path))
         return disks[0]
 
-    open_file.disks = disks  # type: ignore[attr-defined]
+    open_file.disks = disks
     return open_file
 
 

@@ -133,7 +133,7 @@ def test_parameters_come_from_a_target_file(tmp_path: Path) -> None:
 )
 def test_what_is_not_there_is_named(tmp_path: Path, choice: dict[str, object], words: str) -> None:
     with pytest.raises(OptionError, match=words):
-        figures(write_run(tmp_path), tmp_path / "out", print, **choice)  # type: ignore[arg-type]
+        figures(write_run(tmp_path), tmp_path / "out", print, **choice)
 
 
 def test_a_run_that_has_dropped_points_is_refused(tmp_path: Path) -> None:

@@ -79,11 +79,11 @@ def telemetry(n: int = 100, boot_0: float = 50.0, **how: object) -> list[bytes]:
         t = 0.1 * i
         # A tether that delays every message by another time, never by less than 20 ms.
         late = 0.02 + 0.05 * (i * 7 % 10)
-        records.append(record(t + late, 30, attitude(boot_0 + t, 0.05 * t), **how))  # type: ignore[arg-type]
+        records.append(record(t + late, 30, attitude(boot_0 + t, 0.05 * t), **how))
         if i % 5 == 0:
-            records.append(record(t + late, 33, position(boot_0 + t, -t), **how))  # type: ignore[arg-type]
+            records.append(record(t + late, 33, position(boot_0 + t, -t), **how))
         if i % 10 == 0:
-            records.append(record(t + late, 0, heartbeat(19 if t < 5 else 2, t >= 3), **how))  # type: ignore[arg-type]
+            records.append(record(t + late, 0, heartbeat(19 if t < 5 else 2, t >= 3), **how))
     return records
 
 
@@ -95,7 +95,7 @@ def logged(folder: Path, data: bytes, name: str = "dive.dat") -> VehicleLog:
 
 @pytest.mark.parametrize("how", [{}, {"version": 1}, {"signed": True}])
 def test_a_telemetry_log_is_read(tmp_path: Path, how: dict[str, object]) -> None:
-    log = logged(tmp_path, b"".join(telemetry(**how)))  # type: ignore[arg-type]
+    log = logged(tmp_path, b"".join(telemetry(**how)))
     assert log.kind == "tlog"
     assert log.notes == ()
     state = log.at([0.0, 2.55, 9.85])

@@ -327,7 +327,7 @@ def test_reading_ahead_ends_with_its_reader():
     assert [next(reader) for _ in range(3)] == [0, 1, 2]
     time.sleep(0.05)
     assert len(fetched) <= 6
-    reader.close()  # type: ignore[attr-defined]
+    reader.close()
     assert threading.active_count() == n_before
 
 

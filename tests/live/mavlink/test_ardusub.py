@@ -195,7 +195,7 @@ def test_gyros_turn_the_axes_of_the_dome(wire: Wire) -> None:
         pitchspeed=to_pitch * math.cos(roll) + to_heading * math.sin(roll) * math.cos(pitch),
         yawspeed=-to_pitch * math.sin(roll) + to_heading * math.cos(roll) * math.cos(pitch),
     )
-    found = gyro_rates_of(wire, time.monotonic_ns())  # type: ignore[arg-type]
+    found = gyro_rates_of(wire, time.monotonic_ns())
     assert found is not None
     seen = [pose(t).rotation for t in (-step, step)]
     spin = -(seen[1] - seen[0]) / (2.0 * step) @ pose(0.0).rotation.T
@@ -206,19 +206,19 @@ def test_gyros_turn_the_axes_of_the_dome(wire: Wire) -> None:
 def test_gyros_are_worth_less_with_time_and_motion(wire: Wire) -> None:
     def sigma(age_s: float, rate: float) -> float:
         wire.put("ATTITUDE", age_s=age_s, rollspeed=0.0, pitchspeed=0.0, yawspeed=rate)
-        found = gyro_rates_of(wire, time.monotonic_ns())  # type: ignore[arg-type]
+        found = gyro_rates_of(wire, time.monotonic_ns())
         assert found is not None
         return math.degrees(found.sigma)
 
-    assert gyro_rates_of(wire, time.monotonic_ns()) is None  # type: ignore[arg-type]
+    assert gyro_rates_of(wire, time.monotonic_ns()) is None
     # Of a stream of unknown delay, and a net that moves by itself.
     assert 4.0 < sigma(0.0, 0.0) < 5.0
     assert 20.0 < sigma(0.5, 0.0) < 22.0
     assert 10.0 < sigma(0.0, math.radians(90.0)) < 11.0
     wire.put("ATTITUDE", rollspeed=math.nan, pitchspeed=0.0, yawspeed=0.0)
-    assert gyro_rates_of(wire, time.monotonic_ns()) is None  # type: ignore[arg-type]
+    assert gyro_rates_of(wire, time.monotonic_ns()) is None
     wire.put("ATTITUDE", age_s=1.5, rollspeed=0.0, pitchspeed=0.0, yawspeed=0.0)
-    assert gyro_rates_of(wire, time.monotonic_ns()) is None  # type: ignore[arg-type]
+    assert gyro_rates_of(wire, time.monotonic_ns()) is None
 
 
 def test_depth_from_the_best_message(wire: Wire, vehicle: ArduSubLink) -> None:

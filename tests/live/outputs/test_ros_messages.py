@@ -324,8 +324,7 @@ def test_diagnostics() -> None:
     posture = by_name["aqualvs: posture"]
     assert posture.level == Level.OK
     assert float(figures(posture)["range_m"]) == pytest.approx(
-        sample().scan.posture.range,  # type: ignore[union-attr]
-        rel=1e-5,
+        sample().scan.posture.range, rel=1e-5
     )
 
 
