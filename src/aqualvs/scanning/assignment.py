@@ -428,11 +428,10 @@ class AssignmentTest:
         return any(self._visibility(one, subsegments)[3] > n_shown for one in behind)
 
     def _may_be_beyond(self, plane: Plane, fan: IntArray, laser: IntArray) -> bool:
-        """Return whether the stripes, read as the next lasers of a fan, show a plane out of range.
-
-        The fan has four lasers or more, in order.
-        """
-        few, farthest = 3, self._searched[1]
+        """Return whether stripes of a fan, read as the next lasers', show a plane out of range."""
+        # Lines of sight do not quite meet, so that the plane is known to a twentieth only.
+        few, known = 3, 0.95
+        nearest, farthest = known * self._searched[1], _ODDS.max_lit * self._searched[1]
         if len(fan) <= few:
             return False
         for one_way in (fan, fan[::-1]):
@@ -440,8 +439,9 @@ class AssignmentTest:
             sheets = [self._sheets[i] for i in one_way[:-1][is_lit]]
             read_as = [self._sheets[i] for i in one_way[1:][is_lit]]
             other = shifted_plane(plane, sheets, read_as) if len(sheets) > 1 else None
-            may_be_lit = other and farthest <= other.offset <= _ODDS.max_lit * farthest
-            if other is not None and may_be_lit and other.normal[1] >= MIN_FACING:
+            if other is None:
+                continue
+            if nearest <= other.offset <= farthest and other.normal[1] >= MIN_FACING:
                 return True
         return False
 
