@@ -162,3 +162,22 @@ def test_light_along_a_strand_is_off_the_sheets_middle(
     assert isinstance(posture, Posture)
     assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(posture.covariance)))
     assert np.rad2deg(np.abs(off[1:])).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("net", "at", "behind"),
+    [
+        (square(0.0267, 0.0022, -10.6, (0.0626, 0.0507)), (0.39, 5.2, 9.69), 0.27),
+        (square(0.0306, 0.0016, 14.1, (0.0992, 0.0596)), (0.38, 6.16, 5.0), 0.27),
+    ],
+)
+def test_lasers_that_may_have_made_a_stripe_do_not_multiply_its_light(
+    net: Net, at: tuple[float, float, float], behind: float
+) -> None:
+    """The net has most of the light before the wall, each peak counted once.
+
+    Counted for each laser of the fan that may have made it, other light was more, and the wall
+    was measured, 70 % farther.
+    """
+    posture, true = measure("fan", net, at, behind)
+    assert abs(error(posture, true)[0]) < 0.005 * true[0]

@@ -133,10 +133,27 @@ def _find_before(
     cell = np.empty(search.pixels.shape[0], np.int64)
     n_cells, n_columns = number_cells(search.pixels, cell)
     _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, members, before)
-    left = 0.0
-    for c in range(before.shape[0]):
-        left += weight[c] if before[c] else 0.0
+    left = _light_once(subsegments.of_candidate, cell, n_cells, before, weight)
     return bool(sums[SAMPLING_WEIGHT] > left)
+
+
+@inner_kernel
+def _light_once(
+    subsegment_index: IntArray, cell: IntArray, n_cells: int, some: BoolArray, weight: FloatArray
+) -> float:
+    """Return the weight of some subsegments, light that several of them share counted once."""
+    is_lit = np.zeros(n_cells, np.bool_)
+    n, n_lit = np.zeros(some.shape[0], np.int64), np.zeros(some.shape[0], np.int64)
+    for i in range(subsegment_index.shape[0]):
+        c = subsegment_index[i]
+        if some[c]:
+            n[c] += 1
+            n_lit[c] += not is_lit[cell[i]]
+            is_lit[cell[i]] = True
+    light = 0.0
+    for c in range(some.shape[0]):
+        light += weight[c] * n_lit[c] / max(n[c], 1)
+    return light
 
 
 @inner_kernel
