@@ -10,7 +10,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall
@@ -181,3 +181,19 @@ def test_lasers_that_may_have_made_a_stripe_do_not_multiply_its_light(
     """
     posture, true = measure("fan", net, at, behind)
     assert abs(error(posture, true)[0]) < 0.005 * true[0]
+
+
+@pytest.mark.parametrize(
+    ("net", "at", "behind"),
+    [
+        (square(0.0366, 0.0017, 3.2, (0.0479, 0.0959)), (0.44, -1.96, -14.97), 0.26),
+        (square(0.0286, 0.0015, 23.5, (0.095, 0.0071)), (0.49, -6.32, -2.87), 0.34),
+    ],
+)
+def test_a_wall_with_strands_before_many_lasers_is_no_target(
+    net: Net, at: tuple[float, float, float], behind: float
+) -> None:
+    posture, _ = measure("fan", net, at, behind)
+    assert isinstance(posture, Refusal)
+    assert posture.reason is Reason.AMBIGUOUS
+    assert "much light in front of the surface" in posture.detail

@@ -46,7 +46,7 @@ from aqualvs.scanning.assignment_kernels import (
 )
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, sample_bands
-from aqualvs.scanning.net_surfaces import inflate_covariance, seen_through
+from aqualvs.scanning.net_surfaces import has_strands_before, inflate_covariance, seen_through
 from aqualvs.scanning.plane_search import MIN_FACING, WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
 from aqualvs.scanning.posture_estimator import Measurement
@@ -124,6 +124,7 @@ class _AssignmentOptions(NamedTuple):
 
 
 _ODDS = _AssignmentOptions()
+_FEW = 3  # Lasers of a fan that are not many: hardly more than one may have made a peak.
 
 
 class Verdict(Enum):
@@ -302,8 +303,7 @@ class AssignmentTest:
     ) -> bool:
         """Return whether a net without a plane, all folds, may hang in front of a solid target.
 
-        Its light is on no surface, in front of the target, and in short components. If another
-        surface lies behind the target, the target is not a wall behind a net.
+        If another surface lies behind the target, it is not a wall behind a net.
 
         Parameters
         ----------
@@ -323,11 +323,14 @@ class AssignmentTest:
             target.plane.packed(),
             self._searched[0],
         )
-        # Loose light in front of something solid, over its own light. Rendered walls have up to
-        # 0.06 with faint lines on rough texture, 0.10 among fish, bubbles and caustics; walls
-        # behind a folded net have 0.20 to 0.74.
+        # Rendered walls have up to 0.06 with faint lines on rough texture, 0.10 among fish, bubbles
+        # and caustics; walls behind a folded net have 0.20 to 0.74.
         max_loose_share = 0.15
-        return bool(share > max_loose_share)
+        if share > max_loose_share or max(map(len, self._fans)) <= _FEW:
+            return bool(share > max_loose_share)
+        # One of many lasers places nearly all light at the target or behind it.
+        rows, n_lines = subsegments.of_candidate, shapes.n_lines
+        return has_strands_before(candidates, rows, n_lines, target.members, target.plane)
 
     def other_lines(
         self,
@@ -409,8 +412,7 @@ class AssignmentTest:
         """Return whether a target may be a wall out of the range, read as the next lasers' stripes.
 
         The wall is seen through a net, which shows as a mesh behind the target: with more lasers,
-        though the target fills much of its stripes. Tuned on rendered nets before rigs of five and
-        eight lasers; in rigs of three, the next laser is too far away.
+        though the target fills much of its stripes. Tuned on nets rendered for 5 and 8 lasers.
 
         Parameters
         ----------
@@ -430,9 +432,9 @@ class AssignmentTest:
     def _may_be_beyond(self, plane: Plane, fan: IntArray, laser: IntArray) -> bool:
         """Return whether stripes of a fan, read as the next lasers', show a plane out of range."""
         # Lines of sight do not quite meet, so that the plane is known to a twentieth only.
-        few, known = 3, 0.95
+        known = 0.95
         nearest, farthest = known * self._searched[1], _ODDS.max_lit * self._searched[1]
-        if len(fan) <= few:
+        if len(fan) <= _FEW:
             return False
         for one_way in (fan, fan[::-1]):
             is_lit = np.isin(one_way[:-1], laser)

@@ -24,7 +24,7 @@ from aqualvs.geometry.linear_algebra import (
     squared,
 )
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Subsegments
+from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.patch import height_over
 from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
@@ -72,6 +72,54 @@ def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) 
     """
     transitions, at_random, _ = _count_transitions(subsegments, first, second, np.zeros(4))
     return bool(transitions >= _ENOUGH_TRANSITIONS and transitions >= _MIN_TRANSITIONS * at_random)
+
+
+def has_strands_before(
+    candidates: Candidates,
+    of_candidate: IntArray,
+    n_lines: FloatArray,
+    members: BoolArray,
+    plane: Plane,
+) -> bool:
+    """Return whether light in front of a surface may lie on the strands of a net.
+
+    It is in pieces of several search lines, hardly fainter than the surface's stripes and not
+    much wider; of the lasers that may have made a peak, one lights something in front.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        N of them.
+    of_candidate : int array, shape (N,)
+        Row of each one's subsegment.
+    n_lines : array, shape (S,)
+        Search lines of each component.
+    members : bool array, shape (C,)
+        Subsegments on the surface.
+    plane : Plane
+        Of the surface.
+    """
+    # Noise and edges make shorter pieces; least distance in front; limits of height and width.
+    min_lines, before_share, lowest, widest = 25, 0.03, 0.75, 2.5
+    source, confidence, height = candidates.source, candidates.confidence, candidates.height
+    mine, own = members[of_candidate], np.zeros(n_bins(source), np.bool_)
+    own[source[mine]] = True
+    width = np.average(candidates.width[mine], weights=confidence[mine])
+    off = candidates.points @ plane.normal - plane.offset
+    in_front = off < -before_share * plane.offset
+    strand = in_front & ~own[source] & (n_lines[candidates.component] >= min_lines)
+    strand &= (candidates.width <= widest * width) & (height >= lowest * np.median(height[mine]))
+    light, on_strand = np.zeros(len(own)), np.zeros(len(own), np.bool_)
+    light[source], on_strand[source[strand]] = confidence, True
+    # Blocks of search lines with a stripe of the surface, and the share of them with strands.
+    block_lines = 32
+    block = candidates.laser * n_bins(candidates.line) + candidates.line // block_lines
+    spread = np.isin(np.unique(block[mine]), block[strand]).mean()
+    # Least light, as a share of the surface's own, and least spread. Of 33 walls that eight lasers
+    # showed behind a net, 24 have more of both; walls among fish, fans with false edges, and real
+    # walls with 15 lasers, overexposed or in noise, do not.
+    min_share, min_spread = 0.07, 0.28
+    return bool(light[on_strand].sum() > min_share * light[own].sum() and spread > min_spread)
 
 
 def _count_transitions(
