@@ -149,7 +149,7 @@ def test_a_zoomed_picture_is_no_fault_of_the_lasers(
     verdict = verdict_on(rig, scans(zoomed(rig, zoom), rig, target))
     assert verdict.zoom == pytest.approx(zoom, abs=0.01)
     larger = "larger" if zoom > 0.0 else "smaller"
-    assert f"% {larger} than the rig's camera makes it: set zoom, " in verdict.sentence()
+    assert f"% {larger} than the rig's calibration predicts: set zoom, " in verdict.sentence()
     assert verdict.state is AgreementState.ZOOMED
     assert verdict.suspects == ()
     found = verdict.to_dict()
@@ -157,9 +157,20 @@ def test_a_zoomed_picture_is_no_fault_of_the_lasers(
     assert found["words"] == verdict.sentence()
 
 
+def test_software_zooms_about_the_middle_of_the_picture() -> None:
+    """By 4 %: the principal point, 9 px away, moves by 0.4 px, which would be a laser's turn."""
+    width, height = RIG.size_px
+    middle = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
+    lens = zoomed(RIG, 0.04).lens
+    cx, cy = middle + 1.04 * (np.array([lens.cx, lens.cy]) - middle)
+    verdict = verdict_on(RIG, scans(replace(RIG, lens=replace(lens, cx=cx, cy=cy)), RIG))
+    assert verdict.state is AgreementState.ZOOMED
+    assert verdict.zoom == pytest.approx(0.04, abs=0.003)
+
+
 def test_a_zoom_that_the_calibration_leaves_open_is_no_alarm() -> None:
     for share, state in ((1e-3, AgreementState.ZOOMED), (1e-2, AgreementState.AGREE)):
-        known = RigUncertainty.independent({"fx": share * RIG.lens.fx})
+        known = RigUncertainty.independent({"fx": share * RIG.lens.fx, "fy": share * RIG.lens.fy})
         rig = with_uncertainty(RIG, known)
         assert verdict_on(rig, scans(zoomed(rig, 0.03), rig)).state is state
     assert verdict_on(RIG, scans(zoomed(RIG, 0.005), RIG)).state is AgreementState.AGREE
@@ -171,7 +182,10 @@ def test_a_laser_that_may_have_moved_as_a_zoom_moves_it_is_named_beside_the_zoom
     assert verdict.state is AgreementState.DISAGREE
     assert verdict.suspects == (0,)
     assert "laser 1 (lower) is off by" in verdict.sentence()
-    assert " or so, or the picture is " in verdict.sentence()
+    assert (
+        " or so (recalibrate with 'aqualvs calibrate lasers'), or the picture is "
+        in verdict.sentence()
+    )
 
 
 def test_the_sigma_of_a_zoom_is_that_of_drawn_rigs() -> None:
@@ -188,8 +202,8 @@ def test_the_sigma_of_a_zoom_is_that_of_drawn_rigs() -> None:
             assert scan.posture
             m = scan.posture.normal_in_dome / scan.posture.range
             middles.append(bin_stripes(scan.points, m, along_x.astype(np.int64), rig.size_px))
-        found = fit_zoom(middles, rig.camera(), along_x.astype(np.int64), sheets_of(rig))
-        z.append(found.zoom / agreement.sigma_zoom(found))
+        found = fit_zoom(middles, rig, along_x.astype(np.int64), sheets_of(rig))
+        z.append(found.zoom / np.sqrt(agreement.covariance(found, middles)[0, 0]))
     # Of 12 values, with a probability of 99 %.
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.55
 

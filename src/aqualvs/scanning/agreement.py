@@ -6,7 +6,7 @@ and a turn, have six parameters, of which the target's own plane takes three), b
 moved has done so by the same three parameters in all frames, at every range and angle of the
 target; a bulge of a net or a fish in front of it does not. So each laser in turn is assumed to have
 moved; it is named if that explains all frames and no other laser does. A picture that is larger
-than the rig's camera makes it (zoom, stabilisation) does so by one factor in all frames.
+than the rig's calibration predicts (zoom, stabilisation) is so by one factor in all frames.
 
 `bin_stripes` summarises each stripe of a frame by its centroid in a few bins, whatever the labels:
 the points of a laser that has drifted are labelled as clutter or as another surface. `fit_drift`
@@ -18,7 +18,7 @@ and gives the verdict.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -29,7 +29,7 @@ from scipy import optimize
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Rays
 from aqualvs.optics.camera import Camera
-from aqualvs.optics.rig import LASER_PARAMETERS, Rig
+from aqualvs.optics.rig import Rig, rig_moved_by
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
@@ -159,24 +159,10 @@ class DriftFit:
     inliers: float  # Share of residuals below `CUT`.
     # Root mean square distance of that laser's stripe from the targets, as a share of range.
     effect: float
-    # Shape (3 L, 3 L): information of a typical frame on the steps of all lasers: errors of a
-    # stripe are the same in all frames, so that more frames add no information.
-    information: FloatArray
-
-    def covariance(self) -> FloatArray:
-        """Return the covariance (3, 3) of `step`, including its prior."""
-        own = self._own_rows()
-        total = self.information[own, own] + np.diag(_PRIOR**-2.0)
-        return np.asarray(np.linalg.inv(total), dtype=np.float64)
-
-    def by_steps_of_all(self) -> FloatArray:
-        """Return the derivative (3, 3 L) of `step` by errors of the sheets of all lasers (3 L)."""
-        return self.covariance() @ self.information[self._own_rows()]
-
-    def _own_rows(self) -> slice:
-        if self.laser is None:
-            raise ValueError("no laser has moved, so there is no step")
-        return slice(3 * self.laser, 3 * self.laser + 3)
+    weight: FloatArray  # Shape (F, L K): robust weights of the bins.
+    # Size of the picture over the rig's, less 1, about this pixel; 0 and None if it is as it was.
+    zoom: float = 0.0
+    centre_px: FloatArray | None = None
 
 
 def fit_drift(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) -> DriftFit:
@@ -213,7 +199,7 @@ def fit_drift(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) 
         cost=float(np.mean(np.minimum(z, CUT) ** 2)),
         inliers=float(np.mean(z < CUT)),
         effect=0.0 if laser is None else fit.effect(on_sheets, laser, step),
-        information=fit.normal_equations(on_sheets, _columns_by_laser(fit.slopes(on_sheets)))[0],
+        weight=weight,
     )
 
 
@@ -221,64 +207,59 @@ def fit_drift(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) 
 _MAX_ZOOM, _ZOOM_STEP = 0.16, 0.04
 
 
-@dataclass(frozen=True, slots=True)
-class ZoomFit:
-    """Fit of the frames under the hypothesis that the picture is not as large as in the rig."""
-
-    zoom: float  # Size of the picture over the rig's, less 1.
-    cost: float  # As of `DriftFit`.
-    inliers: float
-    # Shape (1 + 3 L, 1 + 3 L): information of a typical frame on the zoom and on the steps of all
-    # lasers.
-    information: FloatArray
-
-
 def fit_zoom(
-    middles: Sequence[FloatArray], camera: Camera, along_x: IntArray, sheets: Sequence[Sheet]
-) -> ZoomFit:
-    """Fit the size of the picture, about its principal point, to all frames.
+    middles: Sequence[FloatArray], rig: Rig, along_x: IntArray, sheets: Sequence[Sheet]
+) -> DriftFit:
+    """Fit the size of the picture to all frames, and a plane to each.
+
+    A lens zooms about its principal point, software about the middle of the picture; the better one
+    counts.
 
     Parameters
     ----------
     middles : sequence of array, shape (L, K, 2)
         Bins of the frames from `bin_stripes`, in `image`.
-    camera : Camera
+    rig : Rig
     along_x : int array, shape (L,)
         As in `bin_stripes`.
     sheets : sequence of Sheet
         One for each laser.
     """
-    centre = np.array([camera.lens.cx, camera.lens.cy])
+    camera, lens = rig.camera(), rig.lens
+    width, height = rig.size_px
 
-    def at(zoom: float) -> SeenStripes:
-        unzoomed = [centre + (middle - centre) / (1.0 + zoom) for middle in middles]
-        return SeenStripes.of(unzoomed, camera, along_x)
+    def fit(zoom: float, centre_px: FloatArray) -> DriftFit:
+        stripes = SeenStripes.of(_unzoomed(middles, zoom, centre_px), camera, along_x)
+        return replace(fit_drift(stripes, sheets, None), zoom=zoom, centre_px=centre_px)
 
-    def cost(zoom: float) -> float:
-        return fit_drift(at(zoom), sheets, None).cost
+    def best(centre_px: FloatArray) -> DriftFit:
+        def cost(zoom: float) -> float:
+            return fit(zoom, centre_px).cost
 
-    tried = np.arange(-_MAX_ZOOM, _MAX_ZOOM + 1e-9, _ZOOM_STEP)
-    near = float(tried[np.argmin([cost(zoom) for zoom in tried.tolist()])])
-    step, limits = 1e-3, (near - _ZOOM_STEP, near + _ZOOM_STEP)
-    zoom = float(optimize.minimize_scalar(cost, bounds=limits, options={"xatol": step}).x)
-    fit = fit_drift(at(zoom), sheets, None)
-    on_sheets, beside = (_SheetPoints.of(at(one), sheets) for one in (zoom, zoom + step))
-    planes = _Fit.of(on_sheets, on_sheets.seen.astype(np.float64))
-    by_zoom = np.einsum("fbi,fi->fb", beside.points - on_sheets.points, planes.m) / step
-    by_zoom *= on_sheets.seen & beside.seen
-    slopes = [by_zoom[..., None], _columns_by_laser(planes.slopes(on_sheets))]
-    information, _ = planes.normal_equations(on_sheets, np.concatenate(slopes, axis=-1))
-    return ZoomFit(zoom, fit.cost, fit.inliers, information)
+        tried = np.arange(-_MAX_ZOOM, _MAX_ZOOM + 1e-9, _ZOOM_STEP).tolist()
+        near = float(min(tried, key=cost))
+        limits = near - _ZOOM_STEP, near + _ZOOM_STEP
+        found = optimize.minimize_scalar(cost, bounds=limits, options={"xatol": 1e-3})
+        return fit(float(found.x), centre_px)
+
+    centres_px = np.array([[lens.cx, lens.cy], [0.5 * (width - 1), 0.5 * (height - 1)]])
+    return min((best(centre_px) for centre_px in centres_px), key=lambda one: one.cost)
+
+
+def _unzoomed(
+    middles: Sequence[FloatArray], zoom: float, centre_px: FloatArray | None
+) -> list[FloatArray]:
+    """Return the bins as they would be in a picture of the rig's size."""
+    if centre_px is None:
+        return list(middles)
+    return [centre_px + (middle - centre_px) / (1.0 + zoom) for middle in middles]
 
 
 def _newton_step(
     fit: "_Fit", on_sheets: "_SheetPoints", laser: int, step: FloatArray
 ) -> FloatArray:
     """Return the Gauss-Newton correction (3,) of the step of one laser, to be subtracted."""
-    slope = np.zeros((*on_sheets.seen.shape, 3))
-    mine = _bins_of(laser)
-    slope[:, mine] = fit.slopes(on_sheets)[:, mine]
-    information, right = fit.normal_equations(on_sheets, slope)
+    information, right = fit.normal_equations(on_sheets, fit.own_slopes(on_sheets, laser))
     prior = _PRIOR**-2.0
     toward = np.linalg.solve(information + np.diag(prior), right + prior * step)
     return np.asarray(toward, dtype=np.float64)
@@ -386,6 +367,12 @@ class _Fit:
         slopes: FloatArray = np.einsum("fbij,fi->fbj", on_sheets.by_step, self.m)
         return slopes
 
+    def own_slopes(self, on_sheets: _SheetPoints, laser: int) -> FloatArray:
+        """Return the derivative (F, L K, 3) of the residuals by the step of one laser."""
+        slope, mine = np.zeros((*on_sheets.seen.shape, 3)), _bins_of(laser)
+        slope[:, mine] = self.slopes(on_sheets)[:, mine]
+        return slope
+
     def normal_equations(
         self, on_sheets: _SheetPoints, slope: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -427,16 +414,6 @@ def _planes(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (inverse @ weighed.sum(axis=1)[..., None])[..., 0], inverse
 
 
-def _columns_by_laser(slope: FloatArray) -> FloatArray:
-    """Expand derivatives by the own laser's step (F, L K, 3) to all steps (F, L K, 3 L)."""
-    n_frames, n, _ = slope.shape
-    n_lasers = n // N_BINS
-    spread = np.zeros((n_frames, n_lasers, N_BINS, n_lasers, 3))
-    own = np.arange(n_lasers)
-    spread[:, own, :, own] = np.moveaxis(slope.reshape(n_frames, n_lasers, N_BINS, 3), 1, 0)
-    return spread.reshape(n_frames, n, 3 * n_lasers)
-
-
 # Frames in the fit; when there are twice as many, every other one is dropped.
 _MAX_FRAMES = 24
 _MIN_FRAMES = 5
@@ -459,7 +436,7 @@ class AgreementState(StrEnum):
     DISAGREE = "disagree"
     """One laser has moved, but it could be one of several, or the picture is zoomed."""
     ZOOMED = "zoomed"
-    """The picture is larger or smaller than the rig's camera makes it."""
+    """The picture is larger or smaller than the rig's calibration predicts."""
     NOT_FLAT = "not_flat"
     """The targets are not flat enough to say."""
     NOT_CHECKED = "not_checked"
@@ -502,7 +479,7 @@ class AgreementVerdict:
         if not self.suspects and not self.zoom:
             return ""
         size = f"{abs(self.zoom):.1%} {'larger' if self.zoom > 0.0 else 'smaller'}"
-        zoomed = f"the picture is {size} than the rig's camera makes it"
+        zoomed = f"the picture is {size} than the rig's calibration predicts"
         settings = "set zoom, stabilisation and field of view as they were for its calibration"
         if self.state is AgreementState.ZOOMED:
             return f"{zoomed}: {settings}, or recalibrate with 'aqualvs calibrate camera'"
@@ -514,7 +491,7 @@ class AgreementVerdict:
             share = f"{self.effect:.1%} of the range"
             return f"{off} (its stripe lies {share} off the others' plane): {remedy}"
         if self.zoom:
-            return f"the lasers disagree: {off} or so, or {zoomed}: {settings}, or {remedy}"
+            return f"the lasers disagree: {off} or so ({remedy}), or {zoomed} ({settings})"
         return f"the lasers disagree: {off} or so: {remedy}"
 
 
@@ -607,13 +584,14 @@ class LaserAgreement:
             key=lambda one: one.cost,
         )
         best = found[0]
-        is_significant = self._is_significant(best)
         if not _is_worse(none, best, _WORSE_SHARE_OF_NONE):
-            return _no_alarm(none if is_significant else best, n_frames)
+            return _no_alarm(none, n_frames)
+        covariance = self.covariance(best, middles)
+        is_significant = _is_significant(best, covariance)
         # A zoom moves the stripes of one laser more than the others', so that one seems to be off.
-        zoomed = fit_zoom(middles, self._camera, self._along_x, sheets)
+        zoomed = fit_zoom(middles, self._rig, self._along_x, sheets)
         zoom = zoomed.zoom if _explains(zoomed, best) else 0.0
-        if zoom and abs(zoom) < _SIGNIFICANT * self.sigma_zoom(zoomed):
+        if zoom and abs(zoom) < _SIGNIFICANT * math.sqrt(self.covariance(zoomed, middles)[0, 0]):
             return AgreementVerdict(AgreementState.AGREE, n_frames)
         if zoom and (zoomed.cost < best.cost or not is_significant):
             return AgreementVerdict(AgreementState.ZOOMED, n_frames, zoom=zoom)
@@ -627,17 +605,16 @@ class LaserAgreement:
         if len(suspects) == len(found) > 2:
             # If each of three lasers or more could have moved, none has: the target is no plane.
             return AgreementVerdict(AgreementState.NOT_FLAT, n_frames)
-        return self._drift_verdict(suspects, n_frames, zoom)
+        return self._drift_verdict(suspects, covariance, n_frames, zoom)
 
     def _drift_verdict(
-        self, suspects: list[DriftFit], n_frames: int, zoom: float
+        self, suspects: list[DriftFit], covariance: FloatArray, n_frames: int, zoom: float
     ) -> AgreementVerdict:
         """Return the verdict that one of the suspects has moved, the likeliest first, or a zoom."""
         best = suspects[0]
         numbers = tuple(one.laser for one in suspects if one.laser is not None)
         tilt = best.step[:2]
         angle = float(np.linalg.norm(tilt))
-        covariance = self._covariance(best)[:2, :2]
         is_sure = len(suspects) == 1 and not zoom
         state = AgreementState.DRIFTED if is_sure else AgreementState.DISAGREE
         return AgreementVerdict(
@@ -646,36 +623,54 @@ class LaserAgreement:
             suspects=numbers,
             names=tuple(self._rig.lasers[i].name for i in numbers),
             angle=angle,
-            sigma_angle=math.sqrt(float(tilt @ covariance @ tilt)) / angle,
+            sigma_angle=math.sqrt(float(tilt @ covariance[:2, :2] @ tilt)) / angle,
             effect=best.effect,
             zoom=zoom,
         )
 
-    def sigma_zoom(self, found: ZoomFit) -> float:
-        """Return the standard deviation of a zoom by errors of stripes and calibration."""
-        known = self._known.of(["fx", *self._laser_parameters()])
-        known[0] /= self._rig.lens.fx
-        known[:, 0] /= self._rig.lens.fx
-        by_errors = found.information[0] / found.information[0, 0]
-        return math.sqrt(float(1.0 / found.information[0, 0] + by_errors @ known @ by_errors))
+    def covariance(self, found: DriftFit, middles: Sequence[FloatArray]) -> FloatArray:
+        """Return the covariance of a laser's step (3, 3), or of a zoom (1, 1).
 
-    def _is_significant(self, found: DriftFit) -> bool:
-        """Return whether the step of a laser is significant, and large enough to matter."""
-        step = found.step
-        sigmas = math.sqrt(float(step @ np.linalg.solve(self._covariance(found), step)))
-        # Least turn in radians, or least effect.
-        angle, effect = math.radians(0.15), 0.005
-        matters = found.effect > effect or float(np.linalg.norm(step[:2])) > angle
-        return sigmas > _SIGNIFICANT and matters
+        By errors of the stripes, which are the same in all frames, and of the rig's numbers.
+        """
 
-    def _covariance(self, found: DriftFit) -> FloatArray:
-        """Return the covariance (3, 3) of a step by errors of stripes and calibration."""
-        known, by_steps_of_all = self._known.of(self._laser_parameters()), found.by_steps_of_all()
-        return found.covariance() + by_steps_of_all @ known @ by_steps_of_all.T
+        def trace(rig: Rig, zoom: float) -> _SheetPoints:
+            places = _unzoomed(middles, zoom, found.centre_px)
+            sheets = list(sheets_of(rig))
+            if found.laser is not None:
+                sheets[found.laser] = _moved(sheets[found.laser], found.step)
+            return _SheetPoints.of(SeenStripes.of(places, rig.camera(), self._along_x), sheets)
 
-    def _laser_parameters(self) -> list[str]:
-        """Return the names of the parameters of all lasers' sheets."""
-        return [f"{laser.name}:{name}" for laser in self._rig.lasers for name in LASER_PARAMETERS]
+        def change(rig: Rig, zoom: float) -> FloatArray:
+            other = trace(rig, zoom)
+            moved = np.einsum("fbi,fi->fb", other.points - points.points, fit.m)
+            return np.asarray((moved * (points.seen & other.seen))[..., None], np.float64)
+
+        points = trace(self._rig, found.zoom)
+        fit, step = _Fit.of(points, found.weight), 1e-3
+        if found.laser is None:
+            own, prior = change(self._rig, found.zoom + step) / step, np.zeros(1)
+        else:
+            own, prior = fit.own_slopes(points, found.laser), _PRIOR**-2.0
+        sigmas = {name: sigma for name, sigma in self._known.sigmas.items() if sigma > 0.0}
+        moved = (rig_moved_by(self._rig, (name,), np.array([s])) for name, s in sigmas.items())
+        by_rig = [change(rig, found.zoom) for rig in moved]
+        information, _ = fit.normal_equations(points, np.concatenate([own, *by_rig], axis=-1))
+        n, scale = len(prior), np.array(list(sigmas.values()))
+        covariance = np.linalg.inv(information[:n, :n] + np.diag(prior))
+        by_errors = covariance @ information[:n, n:] / scale
+        known = self._known.of(list(sigmas))
+        return np.asarray(covariance + by_errors @ known @ by_errors.T, np.float64)
+
+
+def _is_significant(found: DriftFit, covariance: FloatArray) -> bool:
+    """Return whether the step of a laser is significant, and large enough to matter."""
+    step = found.step
+    sigmas = math.sqrt(float(step @ np.linalg.solve(covariance, step)))
+    # Least turn in radians, or least effect.
+    angle, effect = math.radians(0.15), 0.005
+    matters = found.effect > effect or float(np.linalg.norm(step[:2])) > angle
+    return sigmas > _SIGNIFICANT and matters
 
 
 def _no_alarm(found: DriftFit, n_frames: int) -> AgreementVerdict:
@@ -684,7 +679,7 @@ def _no_alarm(found: DriftFit, n_frames: int) -> AgreementVerdict:
     return AgreementVerdict(AgreementState.AGREE if flat else AgreementState.NOT_FLAT, n_frames)
 
 
-def _explains(zoomed: ZoomFit, best: DriftFit) -> bool:
+def _explains(zoomed: DriftFit, best: DriftFit) -> bool:
     """Return whether a zoom explains the frames about as well as the best of the lasers."""
     # Least zoom: one of 3 % moves the range by 0.3 % with lasers like those of the example rig.
     matters = abs(zoomed.zoom) > 0.01
@@ -693,8 +688,6 @@ def _explains(zoomed: ZoomFit, best: DriftFit) -> bool:
     return matters and as_good and zoomed.inliers >= _EXPLAINED
 
 
-def _is_worse(
-    one: DriftFit | ZoomFit, best: DriftFit | ZoomFit, share: float = _WORSE_SHARE
-) -> bool:
+def _is_worse(one: DriftFit, best: DriftFit, share: float = _WORSE_SHARE) -> bool:
     """Return whether a hypothesis costs clearly more than the best one."""
     return one.cost - best.cost > _WORSE_COST + share * best.cost
