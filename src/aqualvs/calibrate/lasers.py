@@ -229,6 +229,9 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     )
     for warning in done.solution.warnings:
         echo(f"note: {warning}")
+    for found in done.found:
+        for remark in found.remarks:
+            echo(remark)
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_laser_text(figures, laser))
     page = _page(before, done, request)

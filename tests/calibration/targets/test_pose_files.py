@@ -79,7 +79,7 @@ def test_poses_are_matched_by_file_name(tmp_path):
     poses = load_poses(_written(tmp_path, "file,distance_mm\na.png,200\nb.png,300\nc.png,400\n"))
     given, notes = match_poses(poses, ["c.png", "a.png"], Path("poses.csv"))
     assert [pose.distance for pose in given] == [0.4, 0.2]
-    assert notes == ("poses.csv: 1 rows without a picture of the board (b.png)",)
+    assert notes == ("poses.csv: without a picture of the board: b.png",)
     assert match_poses(poses, ["a.png", "b.png", "c.png"], Path("p"))[1] == ()
 
 

@@ -203,5 +203,5 @@ def match_poses(
     notes: tuple[str, ...] = ()
     if spare:
         shown = ", ".join(spare[:3]) + (", ..." if len(spare) > 3 else "")
-        notes = (f"{source}: {len(spare)} rows without a picture of the board ({shown})",)
+        notes = (f"{source}: without a picture of the board: {shown}",)
     return tuple(by_name[name] for name in names), notes
