@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Rays
@@ -203,10 +202,6 @@ def fit_drift(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) 
     )
 
 
-# Largest zoom either way, and the step of the zooms that are tried first.
-_MAX_ZOOM, _ZOOM_STEP = 0.16, 0.04
-
-
 def fit_zoom(
     middles: Sequence[FloatArray], rig: Rig, along_x: IntArray, sheets: Sequence[Sheet]
 ) -> DriftFit:
@@ -225,6 +220,8 @@ def fit_zoom(
     sheets : sequence of Sheet
         One for each laser.
     """
+    from scipy import optimize  # Takes long to import, and few dives need it.
+
     camera, lens = rig.camera(), rig.lens
     width, height = rig.size_px
 
@@ -236,9 +233,10 @@ def fit_zoom(
         def cost(zoom: float) -> float:
             return fit(zoom, centre_px).cost
 
-        tried = np.arange(-_MAX_ZOOM, _MAX_ZOOM + 1e-9, _ZOOM_STEP).tolist()
-        near = float(min(tried, key=cost))
-        limits = near - _ZOOM_STEP, near + _ZOOM_STEP
+        # Largest zoom either way, and the step of the zooms that are tried first.
+        largest, step = 0.16, 0.04
+        near = float(min(np.arange(-largest, largest + 1e-9, step).tolist(), key=cost))
+        limits = near - step, near + step
         found = optimize.minimize_scalar(cost, bounds=limits, options={"xatol": 1e-3})
         return fit(float(found.x), centre_px)
 

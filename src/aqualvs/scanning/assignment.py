@@ -175,7 +175,8 @@ class AssignmentTest:
         self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.bool_)
         self._bands = sample_bands(laser_bands, triangulator, CELL_LINES)
         self._sheets = [Plane(row[:3], float(row[3])) for row in triangulator.planes]
-        self._fans = [_in_order(self._sheets, self._along_x, axis) for axis in (True, False)]
+        fans = [_in_order(self._sheets, self._along_x, axis) for axis in (True, False)]
+        self._fans = [fan for fan in fans if len(fan) > _FEW]
 
     def is_by_chance(
         self,
@@ -326,7 +327,7 @@ class AssignmentTest:
         # Rendered walls have up to 0.06 with faint lines on rough texture, 0.10 among fish, bubbles
         # and caustics; walls behind a folded net have 0.20 to 0.74.
         max_loose_share = 0.15
-        if share > max_loose_share or max(map(len, self._fans)) <= _FEW:
+        if share > max_loose_share or not self._fans:
             return bool(share > max_loose_share)
         # One of many lasers places nearly all light at the target or behind it.
         rows, n_lines = subsegments.of_candidate, shapes.n_lines
@@ -419,9 +420,10 @@ class AssignmentTest:
         subsegments, surfaces, target
             As in `is_by_chance`.
         """
+        if not self._fans or not target.is_mesh:
+            return False
         laser = subsegments.laser[target.members]
-        beyond = (self._may_be_beyond(target.plane, fan, laser) for fan in self._fans)
-        if not target.is_mesh or not any(beyond):
+        if not any(self._may_be_beyond(target.plane, fan, laser) for fan in self._fans):
             return False
         visible, _, _, n_shown = self._visibility(target, subsegments)
         if visible < _ODDS.filled:
@@ -434,8 +436,6 @@ class AssignmentTest:
         # Lines of sight do not quite meet, so that the plane is known to a twentieth only.
         known = 0.95
         nearest, farthest = known * self._searched[1], _ODDS.max_lit * self._searched[1]
-        if len(fan) <= _FEW:
-            return False
         for one_way in (fan, fan[::-1]):
             is_lit = np.isin(one_way[:-1], laser)
             sheets = [self._sheets[i] for i in one_way[:-1][is_lit]]
