@@ -377,7 +377,7 @@ class Scanner:
         while target is not None and len(surfaces) > 1:
             if not (
                 assignment.may_be_exchanged(subsegments, target)
-                or assignment.may_be_shifted(subsegments, surfaces, target)
+                or (assignment.fans and assignment.may_be_shifted(subsegments, surfaces, target))
             ):
                 break
             surfaces = [one for one in surfaces if one is not target]

@@ -403,12 +403,12 @@ def _without_copies(views: Sequence[View | str]) -> list[View | str]:
 
     Copies of a picture add no evidence, but would make the sigmas smaller.
     """
-    first: dict[bytes, str] = {}
+    first: dict[bytes, View] = {}
     kept: list[View | str] = []
     for view in views:
         if isinstance(view, View):
-            other = first.setdefault(view.ids.tobytes() + view.pixels.tobytes(), view.name)
-            kept.append(view if other is view.name else f"it is a copy of {other}")
+            original = first.setdefault(view.ids.tobytes() + view.pixels.tobytes(), view)
+            kept.append(view if original is view else f"it is a copy of {original.name}")
         else:
             kept.append(view)
     return kept

@@ -176,7 +176,7 @@ class AssignmentTest:
         self._bands = sample_bands(laser_bands, triangulator, CELL_LINES)
         self._sheets = [Plane(row[:3], float(row[3])) for row in triangulator.planes]
         fans = [_in_order(self._sheets, self._along_x, axis) for axis in (True, False)]
-        self._fans = [fan for fan in fans if len(fan) > _FEW]
+        self.fans = [fan for fan in fans if len(fan) > _FEW]
 
     def is_by_chance(
         self,
@@ -327,7 +327,7 @@ class AssignmentTest:
         # Rendered walls have up to 0.06 with faint lines on rough texture, 0.10 among fish, bubbles
         # and caustics; walls behind a folded net have 0.20 to 0.74.
         max_loose_share = 0.15
-        if share > max_loose_share or not self._fans:
+        if share > max_loose_share or not self.fans:
             return bool(share > max_loose_share)
         # One of many lasers places nearly all light at the target or behind it.
         rows, n_lines = subsegments.of_candidate, shapes.n_lines
@@ -368,10 +368,10 @@ class AssignmentTest:
         # and a net shows at least half of the lasers that a wall behind it does.
         behind, few, half = np.zeros(subsegments.n, np.bool_), 3, 0.5
         for one in surfaces if target.is_mesh else ():
+            if one.is_mesh or not _is_nearer(target, one, subsegments):
+                continue
             n_behind = _n_lasers_on(one, subsegments)
-            shows_all = n_behind >= max(n_on_target, few)
-            is_behind = not one.is_mesh and _is_nearer(target, one, subsegments)
-            if shows_all and is_behind and n_on_target >= half * n_behind:
+            if max(n_on_target, few) <= n_behind and n_on_target >= half * n_behind:
                 behind |= one.members
         share: float = other_lines_share(
             candidates, subsegments.of_candidate, target.members, behind, shapes, n_lasers
@@ -420,10 +420,10 @@ class AssignmentTest:
         subsegments, surfaces, target
             As in `is_by_chance`.
         """
-        if not self._fans or not target.is_mesh:
+        if not target.is_mesh:
             return False
         laser = subsegments.laser[target.members]
-        if not any(self._may_be_beyond(target.plane, fan, laser) for fan in self._fans):
+        if not any(self._may_be_beyond(target.plane, fan, laser) for fan in self.fans):
             return False
         visible, _, _, n_shown = self._visibility(target, subsegments)
         if visible < _ODDS.filled:
