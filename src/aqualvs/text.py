@@ -129,6 +129,12 @@ def sentence(words: str) -> str:
     return f"{words[:1].upper()}{words[1:]}{'' if words.endswith('?') else '.'}"
 
 
+def with_sign(value: float, digits: int) -> str:
+    """Return a number with its sign: "+1.2", "-1.2"; what rounds to zero has none."""
+    text = f"{value:+.{digits}f}"
+    return text if float(text) else text[1:]
+
+
 def signed(text: str) -> str:
     """Return text with a true minus sign before its negative numbers."""
     return text.replace("-", "−")

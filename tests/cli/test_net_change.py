@@ -154,7 +154,7 @@ def test_the_date_is_told_by_the_user_the_names_or_the_video(cage, tmp_path, cap
     arguments = [*map(str, runs), *dates, "-o", str(tmp_path / "out")]
     assert main(["net-change", *arguments]) == 0
     said = capsys.readouterr().out
-    assert f"{runs[0]}: 2026-06-01 (the user)" in said
+    assert f"{runs[0]}: 2026-06-01 (given with --date)" in said
     assert f"{runs[1]}: 2026-06-08 (the video's name)" in said
     assert f"{runs[2]}: 2026-07-01 (the folder's name)" in said
 

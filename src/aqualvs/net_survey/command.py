@@ -166,7 +166,7 @@ NET_CHANGE_PNG, NET_CHANGE_HTML = "net_change.png", "net_change.html"
 NET_CHANGE_FILES = (NET_CHANGE_CSV, HOLES_CHANGE_CSV, NET_CHANGE_PNG, NET_CHANGE_HTML)
 """What is written."""
 
-_GIVEN = "the user"
+_GIVEN = "given with --date"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -38,7 +38,7 @@ from aqualvs.report.figure_style import DARK, PALE, STYLE
 from aqualvs.report.html import Card
 from aqualvs.results.files import replace_text
 from aqualvs.results.run_request import now
-from aqualvs.text import sentence, signed
+from aqualvs.text import sentence, signed, with_sign
 
 _WEEK = 7.0
 # From green (less) over white to brown (more); told apart by colour-blind eyes.
@@ -297,7 +297,7 @@ def _cards(result: Comparison) -> list[Card]:
     found = []
     if growth is not None:
         week, sigma = 100.0 * _WEEK * growth.value, 100.0 * _WEEK * growth.sigma
-        value = signed(f"{week:+.1f} %")
+        value = signed(f"{with_sign(week, 1)} %")
         found.append(Card("Fouling a week", value, f"± {sigma:.1f} %: {verdict(growth)}"))
     if wall is None:
         return found
@@ -381,7 +381,7 @@ def _dives(result: Comparison, origins: Mapping[str, str]) -> html.Raw:
             scale, unit = (np.rad2deg(1.0 / frame.radius), "°") if frame.round else (1.0, " m")
             ends = ((scale, unit), (1.0, " m"))
             words = [
-                signed(f"{k * value:+.2f} ± {k * sigma:.2f}{u}")
+                signed(f"{with_sign(k * value, 2)} ± {k * sigma:.2f}{u}")
                 for (k, u), value, sigma in zip(ends, shift.value, shift.sigma, strict=True)
             ]
         rows.append(

@@ -9,7 +9,7 @@ from aqualvs.net_survey.comparison import LOOKED, Comparison, HoleState, OnWall,
 from aqualvs.net_survey.frames import WallFrame
 from aqualvs.net_survey.growth import CellChange, Growth
 from aqualvs.nets.tables import Cell
-from aqualvs.text import count_text
+from aqualvs.text import count_text, with_sign
 
 STATE_TITLES = {
     HoleState.NEW: "new",
@@ -57,7 +57,7 @@ def rate_text(growth: Growth) -> str:
     """Return growth as percent of the net's area a week."""
     days = 7.0
     week, sigma = 100.0 * days * growth.value, 100.0 * days * growth.sigma
-    return f"{week:+.1f} ± {sigma:.1f} % of the net's area a week"
+    return f"{with_sign(week, 1)} ± {sigma:.1f} % of the net's area a week"
 
 
 def verdict(growth: Growth) -> str:
@@ -109,11 +109,11 @@ def _shift_lines(wall: OnWall) -> Iterator[str]:
         parts = []
         if shift.determined[0] and wall.frame.round:
             degrees, sigma = np.rad2deg([shift.value[0], shift.sigma[0]]) / wall.frame.radius
-            parts.append(f"bearing {degrees:+.1f} ± {sigma:.1f}°")
+            parts.append(f"bearing {with_sign(degrees, 1)} ± {sigma:.1f}°")
         elif shift.determined[0]:
-            parts.append(f"along {shift.value[0]:+.2f} ± {shift.sigma[0]:.2f} m")
+            parts.append(f"along {with_sign(shift.value[0], 2)} ± {shift.sigma[0]:.2f} m")
         if shift.determined[1]:
-            parts.append(f"depth {shift.value[1]:+.2f} ± {shift.sigma[1]:.2f} m")
+            parts.append(f"depth {with_sign(shift.value[1], 2)} ± {shift.sigma[1]:.2f} m")
         how = " and ".join(
             name
             for name, found in (("growth", shift.by_pattern), ("holes", shift.by_holes))
@@ -148,8 +148,9 @@ def _where_lines(wall: OnWall) -> Iterator[str]:
         most = max(apart, key=lambda one: abs(one.excess.z))
         words = "faster" if most.excess.value > 0.0 else "slower"
         size = Growth(abs(most.excess.value), most.excess.sigma)
+        differ = "differs" if len(apart) == 1 else "differ"
         yield (
-            f"  {len(apart)} cells differ from the rest of the wall; surest at "
+            f"  {count_text(len(apart), 'cell')} {differ} from the rest of the wall; surest at "
             f"{_where(wall, most)}, {words} by {rate_text(size).lstrip('+')}"
         )
     elif n > 1:
