@@ -240,7 +240,7 @@ def test_too_few_corners_are_refused():
     board = charuco()
     image, _ = _shot(board, _WHOLE)
     reason = detect_board(image, board, "a.png", min_corners=30)
-    assert reason.startswith("only 24 corners of the board, at least 30")
+    assert reason.startswith("too few corners of the board (24, at least 30")
 
 
 def _marker_set(ids):
@@ -278,7 +278,7 @@ def test_missing_markers_are_refused_with_the_remedy():
         image, _marker_set([40]), "a.png"
     )
     reason = detect_markers(image, _marker_set([3]), "a.png")
-    assert reason.startswith("1 of the markers, but only 4 clean corners, at least 6")
+    assert reason.startswith("1 of the markers, but too few clean corners (4, at least 6")
 
 
 @pytest.mark.samples

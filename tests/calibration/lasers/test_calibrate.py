@@ -243,7 +243,8 @@ def test_a_laser_on_one_plane_only() -> None:
 
     views = kept(box_seen(), without_right)
     expected = (
-        r"2 of 3 of the lasers.*\(not: right\).*on one plane only: view_0.png, plane 'forward'"
+        r"2 of 3 lasers can be solved \(not: right\).*"
+        r"on one plane only: view_0.png, plane 'forward'"
     )
     with pytest.raises(CalibrationError, match=expected):
         calibrate_lasers(RIG, views, box())
@@ -259,7 +260,7 @@ def test_more_lasers_than_expected() -> None:
 
 
 def test_fewer_lasers_than_expected() -> None:
-    with pytest.raises(CalibrationError, match="3 of 5 of the lasers"):
+    with pytest.raises(CalibrationError, match="3 of 5 lasers can"):
         calibrate_lasers(RIG, box_seen(), box(), options=LaserOptions(n_lasers=5))
 
 
@@ -321,7 +322,8 @@ def test_no_stripes() -> None:
 
 def test_boards_all_at_one_place() -> None:
     views = simulated(RIG, [dome_from_board(1)] * 3, board_corners(), board_surface(), noise=NOISE)
-    with pytest.raises(CalibrationError, match=r"0 of 3.*two places of the board that differ"):
+    words = r"none of the lasers.*two places of the board that differ"
+    with pytest.raises(CalibrationError, match=words):
         calibrate_lasers(RIG, views, board_surface())
 
 

@@ -33,8 +33,8 @@ def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: in
     """
     if n_corners > 0:
         return (
-            f"only {n_corners} corners of the board, at least {min_corners} are needed; show more "
-            "of it, or come nearer"
+            f"too few corners of the board ({n_corners}, at least {min_corners} are needed); show "
+            "more of it, or come nearer"
         )
     if board.kind is BoardKind.CHESSBOARD:
         n_x, n_y = board.corner_grid
@@ -86,8 +86,8 @@ def why_no_markers(
     ours = np.isin(markers.ids, marker_set.ids)
     if np.any(ours):
         return (
-            f"{np.count_nonzero(ours)} of the markers, but only {n_corners} clean corners, at "
-            f"least {min_corners} are needed; come nearer, or keep stripes and glare off them"
+            f"{np.count_nonzero(ours)} of the markers, but too few clean corners ({n_corners}, at "
+            f"least {min_corners} are needed); come nearer, or keep stripes and glare off them"
         )
     if len(markers) > 0:
         return (
@@ -102,8 +102,10 @@ def _no_markers(image: GreyImage, dictionary: str, n_read: int) -> str:
         n_other = len(read_markers(image, name)) if _differs(name, dictionary) else 0
         if n_other >= max(_ENOUGH, n_read + 1):
             return f"{n_other} markers of {name}, not of {dictionary}; check the dictionary"
-    what = "no markers" if n_read == 0 else f"only {n_read} markers"
-    return f"{what} of {dictionary}; is the target in the picture, sharp and large enough?"
+    what = f"no markers of {dictionary}"
+    if n_read > 0:
+        what = f"too few markers of {dictionary} ({n_read})"
+    return f"{what}; is the target in the picture, sharp and large enough?"
 
 
 def _differs(name: str, dictionary: str) -> bool:

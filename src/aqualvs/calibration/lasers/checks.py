@@ -517,7 +517,8 @@ def _too_few(
         matched = match_to_rig(rig, split.planes)
         missing = [laser.name for laser, i in zip(rig.lasers, matched, strict=True) if i is None]
         which = f" (not: {', '.join(missing)})"
-    seen = f"{len(split.planes)} of {expected}" if expected is not None else "none"
+    none = expected is None or not split.planes
+    seen = "none of the" if none else f"{len(split.planes)} of {expected}"
     lonely = ""
     if split.unmatched:
         where = sorted({_where(line.patch, views, surfaces) for line in split.unmatched[:4]})
@@ -530,7 +531,7 @@ def _too_few(
         lonely += f"; undecided: {_planes(split.possible, views, surfaces)}"
     count = "give --lasers N, how many there are, or " if split.possible and not expected else ""
     return (
-        f"{seen} of the lasers can be solved{which}: each must be seen {wanted}{lonely}; "
+        f"{seen} lasers can be solved{which}: each must be seen {wanted}{lonely}; "
         f"{count}{_remedy(surfaces)}"
     )
 

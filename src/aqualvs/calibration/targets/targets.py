@@ -65,14 +65,14 @@ def check_enough(views: Sequence[View], n_needed: int, what: str, good: str) -> 
     """
     if len(views) < n_needed:
         raise CalibrationError(
-            f"{len(views)} pictures show the board; the {what} needs {n_needed} at least, and "
-            f"{good} to be good"
+            f"pictures that show the board: {len(views)}; the {what} needs {n_needed} at least, "
+            f"and {good} to be good"
         )
     points = sum(len(view) for view in views)
     min_points = 60
     if points < min_points:
         raise CalibrationError(
-            f"{points} board corners in {len(views)} pictures; the {what} needs {min_points} at "
+            f"board corners in all pictures together: {points}; the {what} needs {min_points} at "
             "least; show more of the board, or more often"
         )
 
