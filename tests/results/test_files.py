@@ -275,7 +275,13 @@ def test_the_last_calibration_is_the_one_before_all_four_steps(tmp_path: Path) -
     path = tmp_path / "rig.yaml"
     names = ("camera", "dome", "lasers", "water")
     calibrated(path, *((name, step(2026, 5, 1, 9 + i)) for i, name in enumerate(names)))
-    with pytest.raises(RigError, match="no dated copy of an earlier calibration"):
+    (newest, *_) = dated_copies(path)
+    words = rf"of an earlier calibration \(steps less than 12 hours .*--against {newest}"
+    with pytest.raises(RigError, match=words):
+        last_calibration(path)
+    for copy in dated_copies(path):
+        copy.unlink()
+    with pytest.raises(RigError, match=r"no dated copy is beside it.*--against FILE"):
         last_calibration(path)
     may = load_rig(path)
     calibrated(path, *((name, step(2026, 8, 1, 9 + i)) for i, name in enumerate(names)))

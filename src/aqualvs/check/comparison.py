@@ -268,7 +268,8 @@ def last_calibration(path: Path) -> Path:
         if started - date <= _PAUSE:
             latest.add((name, date))
             started = date
-    for copy in dated_copies(path):
+    copies = dated_copies(path)
+    for copy in copies:
         try:
             found = solved_steps(load_rig(copy, need_lasers=False))
         except RigError:
@@ -276,8 +277,16 @@ def last_calibration(path: Path) -> Path:
         steps = {(name, step.date) for name, step in found.items()}
         if steps and not steps & latest:
             return copy
+    if not copies:
+        raise RigError(
+            f"{path}: no dated copy is beside it, such as calibrations keep of the file that they "
+            "replace; name an older rig file: --against FILE"
+        )
+    hours = _PAUSE.total_seconds() / 3600.0
     raise RigError(
-        f"{path}: no dated copy of an earlier calibration is kept beside it; name an older rig file"
+        f"{path}: no dated copy beside it is of an earlier calibration (steps less than {hours:g} "
+        "hours apart count as one); name the file to compare with, for example --against "
+        f"{copies[0]}"
     )
 
 
