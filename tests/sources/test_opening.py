@@ -258,6 +258,13 @@ def test_a_mistyped_port_or_camera_is_told_what_to_type(typed, hint, tmp_path, m
     assert ("or type" in str(fault.value)) == bool(hint)
 
 
+@pytest.mark.parametrize("opener", [open_source, open_feed])
+def test_an_address_of_an_unknown_kind_is_shown_as_typed_with_those_that_are_known(opener):
+    words = r"foo://bar: unknown kind of address; give one .* http, .* tcp or udp, or a path"
+    with pytest.raises(SourceError, match=words):
+        opener("foo://bar")
+
+
 def test_a_missing_file_is_refused_at_once(tmp_path):
     with pytest.raises(SourceError, match="no such file"):
         open_feed(tmp_path / "missing.mp4")

@@ -231,6 +231,11 @@ def existing_path(where: str | Path, topic: str | None = None) -> tuple[Path, st
     """
     path, topic = _split_topic(where, topic)
     if not path.exists():
+        if re.match(r"[a-z][a-z\d+.-]*://", str(where), re.IGNORECASE):
+            raise SourceError(
+                f"{where}: unknown kind of address; give one that begins with "
+                f"{', '.join(STREAM_SCHEMES[:-1])} or {STREAM_SCHEMES[-1]}, or a path"
+            )
         raise SourceError(f"{path}: no such file or folder; check the path{_hint(str(path))}")
     return path, topic
 
