@@ -259,7 +259,6 @@ def test_memory_stays_flat(request_for, tmp_path, monkeypatch):
     [
         ({"source": "missing.mp4"}, SourceError, "no such file"),
         ({"frames": FrameWindow(100)}, OptionError, "no such frames"),
-        ({"water": Water(n_water=3.0)}, OptionError, "--water-n 3"),
         ({"water": Water(n_water=1.34, salinity=35.0)}, OptionError, "not both"),
         ({"water": Water(salinity=35.0)}, OptionError, "--temperature-c: missing"),
         ({"water": Water(temperature_c=10.0)}, OptionError, "--salinity: missing"),

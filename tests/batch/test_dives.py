@@ -116,6 +116,8 @@ def test_a_list_tells_the_log_of_each_dive(season):
         ("dive,camera\na.mp4,b\n", "unknown key 'camera'"),
         ("rig\nr.yaml\n", "row 1 names no dive"),
         ("dive,water_n\na.mp4,wet\n", "water_n is 'wet'"),
+        ("dive,water_n\na.mp4,3\n", "row 1: water_n 3: no water"),
+        ("dive,salinity\na.mp4,0.035\n", "row 1: salinity 0.035: give per mille"),
         ("dive\n", "lists no dive"),
         ("dive,log_offset_s\na.mp4,late\n", "log_offset_s is 'late'"),
     ],

@@ -3,7 +3,6 @@
 import pytest
 import yaml
 
-from aqualvs.cli.main import main
 from shell_cases import rig_file
 
 
@@ -63,10 +62,63 @@ def test_a_design_in_metres_is_refused(refused):
     assert "[0.3, 1.2], but these are millimetres; write [300, 1200] if" in said
 
 
-def test_a_share_of_salt_is_remarked(capfd, refused):
+@pytest.mark.parametrize("command", ["run", "live", "batch", "calibrate water"])
+@pytest.mark.parametrize(
+    ("option", "value", "remedy"),
+    [
+        ("--salinity", "0.035", "give per mille, from 0 to 40: 0 for fresh water, 35 if a share"),
+        ("--salinity", "-1", "give per mille, from 0 to 40"),
+        ("--salinity", "350", "give per mille, from 0 to 40"),
+        ("--temperature-c", "288", "give degrees Celsius, from 0 to 30; 14.85 if kelvin are meant"),
+        ("--temperature-c", "59", "give degrees Celsius, from 0 to 30; 15 if degrees Fahrenheit"),
+        ("--temperature-c", "-3", "give degrees Celsius, from 0 to 30"),
+    ],
+)
+def test_every_command_refuses_what_is_no_water(command, option, value, remedy, refused, tmp_path):
+    rig = rig_file(tmp_path)
+    arguments = [*command.split(), "dive.mp4", "--rig", rig, option, value]
+    if command != "live":
+        arguments += ["-o", tmp_path / "out"]
+    if command == "calibrate water":
+        arguments += ["--target", "target.yaml"]
+    assert f"{option} {value}: {remedy}" in refused(*arguments)
+
+
+@pytest.mark.parametrize("salinity", ["35", "0", "0.5"])
+def test_water_is_taken(salinity, refused):
     run = ["run", "nothing.mp4", "--rig", "rig.yaml", "--temperature-c", "12"]
-    for salinity in ("35", "0", "0.5"):
-        assert "per mille" not in refused(*run, "--salinity", salinity)
-    assert main([*run, "--salinity", "0.035"]) == 2
-    first = capfd.readouterr().err.splitlines()[0]
-    assert first == "aqualvs: remark: --salinity 0.035: salinity is per mille; sea water has 35"
+    assert "per mille" not in refused(*run, "--salinity", salinity)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "remedy"),
+    [
+        ("--inner-radius-mm", "0.044", "give millimetres, from 1 to 2000; 44 if metres are meant"),
+        ("--inner-radius-mm", "44000", "give millimetres, from 1 to 2000"),
+        ("--thickness-mm", "0.006", "give millimetres, from 0.1 to 200; 6 if metres are meant"),
+        ("--port-distance-mm", "0.012", "give millimetres, from 0.1 to 2000; 12 if metres are"),
+        ("--n-acrylic", "149", "give a refractive index, 1 to 3; acrylic has 1.49"),
+    ],
+)
+def test_housings_that_cannot_be_are_refused(option, value, remedy, refused):
+    dome = ["calibrate", "dome", "x.png", "--board", "b.yaml", "--rig", "rig.yaml", "-o", "r.yaml"]
+    assert f"{option} {value}: {remedy}" in refused(*dome, option, value)
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        (
+            {"dome": {"inner_radius_mm": 0.044, "thickness_mm": 0.006, "n_acrylic": 1.49}},
+            "dome.inner_radius_mm is 0.044, but these are millimetres; write 44 if metres are",
+        ),
+        (
+            {"water": {"temperature_c": 15, "salinity_permille": 0.038}},
+            "water.salinity_permille is 0.038; give per mille, from 0 to 40: 0 for fresh water, 38",
+        ),
+    ],
+)
+def test_rig_files_in_other_units_are_refused(part, said, refused, tmp_path):
+    path = rig_file(tmp_path)
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), **part}))
+    assert said in refused("check", path)

@@ -270,7 +270,7 @@ FAULTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"water__temperature_c": 15}, ("water gives n and", "keep either")),
     (
         {"water": {"temperature_c": 90, "salinity_permille": 0}},
-        ("water: water temperature 90", "0 to 30"),
+        ("water.temperature_c is 90", "give degrees Celsius, from 0 to 30"),
     ),
     ({"lasers": {"name": "a"}}, ("lasers is {'name': 'a'}", "square brackets")),
     ({"lasers__1__normal": [0, 0, 0]}, ("lasers[1].normal is [0", "no direction")),

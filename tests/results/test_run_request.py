@@ -2,6 +2,9 @@
 
 from dataclasses import replace
 
+import pytest
+
+from aqualvs.errors import OptionError
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.results.run_request import Water
 from aqualvs.simulation.scenarios import example_rig
@@ -15,3 +18,12 @@ def test_water_of_red_lasers_has_the_index_of_red_light() -> None:
     assert water.applied_to(red).n_water == seawater_index_vacuum(
         12.0, 35.0, 650.0, n_air=rig.n_air
     )
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [({"n_water": 3.0}, "--water-n 3: no water"), ({"salinity": 0.035}, "--salinity 0.035: give")],
+)
+def test_what_is_no_water_is_refused(values, words):
+    with pytest.raises(OptionError, match=words):
+        Water(**values)

@@ -26,9 +26,10 @@ from typing import Any
 
 from aqualvs.batch.dataset import NET_FACTS
 from aqualvs.errors import OptionError, RigError, SourceError, check_commas
+from aqualvs.optics.water import water_fault
 from aqualvs.recording import is_recording
 from aqualvs.results.folder import RUN_YAML
-from aqualvs.results.run_request import Water
+from aqualvs.results.run_request import Water, checked_index
 from aqualvs.sources.images import is_image_name, natural_key
 from aqualvs.text import count_text, hole_count
 from aqualvs.yamlfile import parse_yaml, read_text
@@ -195,6 +196,11 @@ def _dive_of_row(row: Mapping[str, Any], path: Path, number: int) -> Dive:
 
 def _water(row: Mapping[str, Any], path: Path, number: int) -> Water:
     n_water, temperature_c, salinity = (_number(row, key, path, number) for key in _NUMBERS)
+    if n_water is not None:
+        checked_index(n_water, f"{path}: row {number}: water_n")
+    key, remedy = water_fault(temperature_c, salinity)
+    if key:
+        raise OptionError(f"{path}: row {number}: {key} {row[key]}: {remedy}")
     return Water(n_water=n_water, temperature_c=temperature_c, salinity=salinity)
 
 

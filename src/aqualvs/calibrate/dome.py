@@ -71,13 +71,31 @@ class DomeRequest:
     refine_intrinsics: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse negative tolerances.
+        """Refuse negative tolerances, and housings that cannot be.
 
         Raises `OptionError` naming the option and its value.
         """
+        _check_length("--inner-radius-mm", self.inner_radius_mm, 1.0, 2000.0)
+        _check_length("--port-distance-mm", self.port_distance_mm, 0.1, 2000.0)
+        # Zero is an infinitely thin housing.
+        if self.thickness_mm != 0.0:
+            _check_length("--thickness-mm", self.thickness_mm, 0.1, 200.0)
+        if self.n_acrylic is not None and not 1.0 <= self.n_acrylic <= 3.0:
+            raise OptionError(
+                f"--n-acrylic {self.n_acrylic:g}: give a refractive index, 1 to 3; acrylic has 1.49"
+            )
         tolerances = ("radius_tolerance_mm", "thickness_tolerance_mm", "acrylic_tolerance")
         sigmas = ("distance_sigma_mm", "shared_tilt_sigma_deg")
         check_options(self, *tolerances, *sigmas, least=0.0, wanted="0 or more")
+
+
+def _check_length(option: str, length_mm: float | None, least: float, most: float) -> None:
+    """Raise `OptionError` for a length that no housing has; it names the unit that may be meant."""
+    if length_mm is None or least <= length_mm <= most:
+        return
+    in_metres = 1e3 * length_mm
+    hint = f"; {in_metres:g} if metres are meant" if least <= in_metres <= most else ""
+    raise OptionError(f"{option} {length_mm:g}: give millimetres, from {least:g} to {most:g}{hint}")
 
 
 def calibrate_dome(

@@ -64,18 +64,8 @@ Fit = Annotated[
 WaterIndex = Annotated[float | None, typer.Option(help="Refractive index of the water.")]
 Celsius = Annotated[float | None, typer.Option(help="Water temperature, to compute its index.")]
 
-
-def _per_mille(salinity: float | None) -> float | None:
-    """Print a remark if a salinity looks like a fraction (0.035) instead of per mille (35)."""
-    if salinity is not None and 0.0 < salinity < 0.1:
-        remark = f"--salinity {salinity:g}: salinity is per mille; sea water has 35"
-        typer.echo(f"aqualvs: remark: {remark}", err=True)
-    return salinity
-
-
 Salinity = Annotated[
-    float | None,
-    typer.Option(callback=_per_mille, help="Salinity in per mille, to compute the water's index."),
+    float | None, typer.Option(help="Salinity in per mille, to compute the water's index.")
 ]
 Refraction = Annotated[
     bool,

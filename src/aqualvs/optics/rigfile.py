@@ -38,7 +38,7 @@ from aqualvs.optics.rigschema import (
 )
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.optics.solved import rig_uncertainty
-from aqualvs.optics.water import index_in_seawater, seawater_index_vacuum
+from aqualvs.optics.water import index_in_seawater, seawater_index_vacuum, water_fault
 from aqualvs.schema import StrictPart, si_values
 from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, rig_text
 
@@ -294,17 +294,34 @@ def _housing(file: RigFile) -> Housing | None:
 def housing_of(dome: StrictPart | None, flat: StrictPart | None) -> Housing | None:
     """Return the housing that one of two sections of a file describes; None without both.
 
-    Raises `RigError` if both are given.
+    Raises `RigError` if both are given, or a length is in metres.
     """
     if dome is not None and flat is not None:
         raise RigError("dome and flat: both are given; leave one out, a camera has one housing")
     if dome is not None:
-        return Dome(**si_values(dome))
+        values = si_values(dome)
+        _refuse_metres("dome.inner_radius_mm", values["inner_radius"])
+        return Dome(**values)
     if flat is None:
         return None
     values = si_values(flat)
+    _refuse_metres("flat.distance_mm", values["distance"])
     tilt_x, tilt_y = values.pop("tilt", (0.0, 0.0))
     return FlatPort(**values, tilt_x=tilt_x, tilt_y=tilt_y)
+
+
+def _refuse_metres(key: str, length: float) -> None:
+    """Raise `RigError` for a length, in metres, that no housing has because it is in another unit.
+
+    It must be positive; what is not is refused where the housing is made.
+    """
+    # No dome has so small a radius, and no lens its pupil so near a port.
+    smallest = 1e-4
+    if 0.0 < length < smallest:
+        raise RigError(
+            f"{key} is {_MILLI * length:g}, but these are millimetres; write "
+            f"{_MILLI**2 * length:g} if metres are meant"
+        )
 
 
 def shutter_from_part(part: ShutterPart) -> Shutter:
@@ -359,7 +376,7 @@ def water_index(water: WaterPart, n_air: float, lasers: Sequence[Laser]) -> floa
 
     They do for the light that `water` names, or else for that of the lasers.
 
-    Raises `RigError` if it gives none, or more than one.
+    Raises `RigError` if it gives none or more than one, or numbers that are none of water.
     """
     measured = (water.temperature_c, water.salinity_permille, water.wavelength_nm)
     if water.n is not None:
@@ -374,6 +391,10 @@ def water_index(water: WaterPart, n_air: float, lasers: Sequence[Laser]) -> floa
             "water has no index; write 'water: {n: 1.3333}', or both temperature_c and "
             "salinity_permille"
         )
+    name, remedy = water_fault(water.temperature_c, water.salinity_permille)
+    if name:
+        key = "salinity_permille" if name == "salinity" else name
+        raise RigError(f"water.{key} is {getattr(water, key):g}; {remedy}")
     try:
         if water.wavelength_nm is None:
             light_nm = common_wavelength(lasers)

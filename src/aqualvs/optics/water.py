@@ -128,6 +128,31 @@ def _checked(*values: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     return t, s, w
 
 
+def water_fault(temperature_c: float | None, salinity_permille: float | None) -> tuple[str, str]:
+    """Return which of these the user gave in another unit, or for no water, and the remedy.
+
+    None was not given. Returns "temperature_c" or "salinity" and the remedy, or two empty texts.
+    """
+    warmest_c, kelvin_from, saltiest, least_salt = 30.0, 200.0, 40.0, 0.1
+    if temperature_c is not None and not 0.0 <= temperature_c <= warmest_c:
+        celsius, unit = temperature_c - 273.15, "kelvin"
+        if temperature_c < kelvin_from:
+            celsius, unit = (temperature_c - 32.0) / 1.8, "degrees Fahrenheit"
+        hint = ""
+        if temperature_c > warmest_c and 0.0 <= celsius <= warmest_c:
+            hint = f"; {celsius:.4g} if {unit} are meant"
+        return "temperature_c", f"give degrees Celsius, from 0 to {warmest_c:g}{hint}"
+    if salinity_permille is None or salinity_permille == 0.0:
+        return "", ""
+    remedy = f"give per mille, from 0 to {saltiest:g}"
+    if 0.0 < salinity_permille < least_salt:
+        # Fresh water has 0.05 to 0.5; less than 0.1 changes the index by 2e-5.
+        share = 1e3 * salinity_permille
+        hint = f", {share:g} if a share is meant" if share <= saltiest else ""
+        return "salinity", f"{remedy}: 0 for fresh water{hint}"
+    return ("", "") if 0.0 < salinity_permille <= saltiest else ("salinity", remedy)
+
+
 def index_in_seawater(
     temperature_c: float, salinity_permille: float, light_nm: float | None, n_air: float
 ) -> float:

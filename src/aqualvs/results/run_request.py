@@ -19,7 +19,7 @@ from aqualvs.errors import OptionError, SourceError
 from aqualvs.nets.target_file import NetRequest, target_dict
 from aqualvs.optics.rig import Rig, common_wavelength
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.optics.water import index_in_seawater
+from aqualvs.optics.water import index_in_seawater, water_fault
 from aqualvs.results.files import replace_text
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.detection import DETECTORS, detector_word
@@ -119,6 +119,18 @@ class Water:
     temperature_c: float | None = None
     salinity: float | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse numbers that are none of water.
+
+        Raises `OptionError` naming the option and its value.
+        """
+        if self.n_water is not None:
+            checked_index(self.n_water, "--water-n")
+        name, remedy = water_fault(self.temperature_c, self.salinity)
+        if name:
+            option = f"--{name.replace('_', '-')}"
+            raise OptionError(f"{option} {getattr(self, name):g}: {remedy}")
+
     @property
     def seawater(self) -> tuple[float, float] | None:
         """Temperature and salinity; None without them.
@@ -141,7 +153,7 @@ class Water:
         if self.n_water is not None:
             if (self.temperature_c, self.salinity) != (None, None):
                 raise OptionError("--water-n: give the index or temperature and salinity, not both")
-            return rig.in_water(checked_index(self.n_water, "--water-n"))
+            return rig.in_water(self.n_water)
         if self.seawater is None:
             return rig
         light_nm = common_wavelength(rig.lasers)
