@@ -103,4 +103,5 @@ def test_copies_of_a_picture_are_left_out_and_named(tmp_path):
     found = detect_targets(tmp_path, seen, "board")
     assert [view.name for view in found.views] == ["a.png", "b.png", "c.png"]
     assert found.missed == {"d.png": "it is a copy of b.png"}
+    assert found.copies == {"d.png": "b.png"}
     assert "d.png: left out, it is a copy of b.png" in found.remarks

@@ -9,7 +9,7 @@ import contextlib
 import glob
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeAlias, TypeVar
 
@@ -180,6 +180,8 @@ class DetectedTargets:
     size_px: tuple[int, int]  # Width and height of every picture.
     missed: dict[str, str]  # By name of each picture in which it was not found: the reason.
     pose_notes: tuple[str, ...] = ()  # Remarks on poses that the user gave for the pictures.
+    # By name of each picture that is a copy: the name of the first one. They are `missed`, too.
+    copies: dict[str, str] = field(default_factory=dict)
 
     @property
     def first(self) -> str:
@@ -383,10 +385,17 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
         ],
         [size for _, size in results],
     )
-    views = _without_copies([view for view, _ in results])
-    missed = {name: why for name, why in zip(names, views, strict=True) if isinstance(why, str)}
+    views = [view for view, _ in results]
+    copies = _copies(views)
+    missed = {
+        names[i]: view if isinstance(view, str) else f"it is a copy of {copies[i]}"
+        for i, view in enumerate(views)
+        if isinstance(view, str) or i in copies
+    }
     found = [
-        (one, view) for one, view in zip(pictures, views, strict=True) if isinstance(view, View)
+        (pictures[i], view)
+        for i, view in enumerate(views)
+        if isinstance(view, View) and i not in copies
     ]
     if not found:
         name, why = next(iter(missed.items()))
@@ -394,24 +403,27 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
             f"{target}: found in none of {len(pictures)} pictures; {name}: {why}"
         )
     return DetectedTargets(
-        tuple(view for _, view in found), tuple(one for one, _ in found), size_px, missed
+        tuple(view for _, view in found),
+        tuple(one for one, _ in found),
+        size_px,
+        missed,
+        copies={names[i]: original for i, original in copies.items()},
     )
 
 
-def _without_copies(views: Sequence[View | str]) -> list[View | str]:
-    """Return the views, each one equal to an earlier one to the bit replaced by the reason.
+def _copies(views: Sequence[View | str]) -> dict[int, str]:
+    """Return the places of views that equal an earlier one to the bit, with the name of that one.
 
     Copies of a picture add no evidence, but would make the sigmas smaller.
     """
     first: dict[bytes, View] = {}
-    kept: list[View | str] = []
-    for view in views:
+    copies = {}
+    for i, view in enumerate(views):
         if isinstance(view, View):
             original = first.setdefault(view.ids.tobytes() + view.pixels.tobytes(), view)
-            kept.append(view if original is view else f"it is a copy of {original.name}")
-        else:
-            kept.append(view)
-    return kept
+            if original is not view:
+                copies[i] = original.name
+    return copies
 
 
 def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTargets:

@@ -247,7 +247,8 @@ def _board_set(
     check_same_size(rig, found)
     given: tuple[BoardPose | None, ...] = ()
     if rows is not None and poses is not None:
-        given, notes = match_poses(rows, [view.name for view in found.views], Path(poses))
+        names = [view.name for view in found.views]
+        given, notes = match_poses(rows, names, Path(poses), copies=found.copies)
         found = replace(found, pose_notes=notes)
     in_air = rig.is_air(n_medium)
     board_set = BoardSet(

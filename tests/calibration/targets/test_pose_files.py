@@ -83,6 +83,16 @@ def test_poses_are_matched_by_file_name(tmp_path):
     assert match_poses(poses, ["a.png", "b.png", "c.png"], Path("p"))[1] == ()
 
 
+def test_copies_of_a_picture_need_no_pose_but_must_not_have_another(tmp_path):
+    text = "file,distance_mm\na.png,200\nb.png,300\nc.png,300\n"
+    poses, names = load_poses(_written(tmp_path, text)), ["a.png", "b.png"]
+    assert match_poses(poses, names, Path("p"), copies={"c.png": "b.png"})[1] == ()
+    assert match_poses(poses, names[:1], Path("p"), copies={"d.png": "a.png"})[0] == poses[:1]
+    words = "c.png is a copy of the picture a.png, but their distances are 200 and 300 mm"
+    with pytest.raises(CalibrationError, match=words):
+        match_poses(poses, names, Path("p"), copies={"c.png": "a.png"})
+
+
 def test_a_picture_without_a_row_is_refused(tmp_path):
     poses = load_poses(_written(tmp_path, "file,distance_mm\nview_1.png,200\n"))
     with pytest.raises(

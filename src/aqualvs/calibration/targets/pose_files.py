@@ -8,7 +8,7 @@ distance or the matrix may be left out.
 import csv
 import difflib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -174,8 +174,33 @@ def _check_agreement(pose: SE3, distance_mm: float, place: str) -> None:
         )
 
 
+def _check_copy(copy: BoardPose, original: BoardPose, source: Path) -> None:
+    """Raise `CalibrationError` if one picture was given two poses, under two names."""
+    if _numbers(copy) != _numbers(original):
+        first, second = original.distance, copy.distance
+        differ = "rows differ"
+        if first is not None and second is not None and first != second:
+            differ = f"distances are {_MM * first:g} and {_MM * second:g} mm"
+        raise CalibrationError(
+            f"{source}: {copy.name} is a copy of the picture {original.name}, but their {differ}; "
+            "take the wrong row and picture out, or put the right picture there"
+        )
+
+
+def _numbers(pose: BoardPose) -> tuple[float | None, bytes]:
+    """Return what a row states, to be compared."""
+    place = pose.dome_from_board
+    if place is None:
+        return pose.distance, b""
+    return pose.distance, place.rotation.tobytes() + place.translation.tobytes()
+
+
 def match_poses(
-    poses: Sequence[BoardPose], names: Sequence[str], source: Path
+    poses: Sequence[BoardPose],
+    names: Sequence[str],
+    source: Path,
+    *,
+    copies: Mapping[str, str] | None = None,
 ) -> tuple[tuple[BoardPose, ...], tuple[str, ...]]:
     """Return the pose of each picture, in the pictures' order, and remarks.
 
@@ -185,13 +210,19 @@ def match_poses(
         Rows of the file.
     source : Path
         The file, for messages.
+    copies : mapping, optional
+        Names of pictures that are left out as copies, with the names of those that they repeat.
 
     Raises
     ------
     CalibrationError
-        If a picture has no row.
+        If a picture has no row, or the rows of a picture and its copy contradict each other.
     """
+    copies = copies or {}
     by_name = {pose.name: pose for pose in poses}
+    for copy, original in copies.items():
+        if copy in by_name and original in by_name:
+            _check_copy(by_name[copy], by_name[original], source)
     for name in names:
         if name not in by_name:
             close = difflib.get_close_matches(name, by_name, n=1, cutoff=0.6)
@@ -199,7 +230,7 @@ def match_poses(
             raise CalibrationError(
                 f"{source}: has no row for {name}; add one, or leave the picture out{hint}"
             )
-    spare = [name for name in by_name if name not in set(names)]
+    spare = [name for name in by_name if name not in {*names, *copies}]
     notes: tuple[str, ...] = ()
     if spare:
         shown = ", ".join(spare[:3]) + (", ..." if len(spare) > 3 else "")
