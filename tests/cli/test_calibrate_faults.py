@@ -92,6 +92,16 @@ def test_mixed_sizes_and_what_is_no_picture(folder, refused, tmp_path):
     assert "view_3.png: not a readable picture" in said
 
 
+def test_a_video_is_no_picture_and_how_to_get_some(folder, refused, tmp_path):
+    video = tmp_path / "a dive.mp4"
+    video.write_text("no picture")
+    said = refused(
+        *("calibrate", "camera", video, "--board", folder / "board.yaml", "-o", tmp_path / "r.yaml")
+    )
+    assert "a dive.mp4: is a video, but this step takes pictures" in said
+    assert said.endswith(f"-i '{video}' -r 1 '{tmp_path / 'a dive_%03d.png'}'")
+
+
 def test_a_dome_that_nobody_measured(folder, faulty, tmp_path):
     said = faulty("dome", rig=folder / "bare.yaml")
     assert "bare.yaml: has no dome; give --inner-radius-mm" in said

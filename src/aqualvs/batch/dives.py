@@ -30,7 +30,7 @@ from aqualvs.optics.water import water_fault
 from aqualvs.recording import is_recording
 from aqualvs.results.folder import RUN_YAML
 from aqualvs.results.run_request import Water, checked_index
-from aqualvs.sources.images import is_image_name, natural_key
+from aqualvs.sources.images import VIDEO_SUFFIXES, is_image_name, natural_key
 from aqualvs.text import count_text, hole_count
 from aqualvs.yamlfile import parse_yaml, read_text
 
@@ -215,14 +215,6 @@ def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float 
         raise OptionError(f"{path}: row {number}: {key} is {row[key]!r}; give a number")
     return value
 
-
-VIDEO_SUFFIXES = frozenset(
-    [
-        *(".avi", ".h264", ".h265", ".m2ts", ".m4v", ".mkv", ".mov"),
-        *(".mp4", ".mpeg", ".mpg", ".mts", ".ts", ".webm", ".wmv"),
-    ]
-)
-"""Files that are dives when a folder is given; a file that is named may have any suffix."""
 
 RIG_YAML = "rig.yaml"
 _RECORDING = ".mcap"

@@ -7,6 +7,7 @@ The nominal rig (`load_nominal`) is known before any calibration: name, picture 
 
 import contextlib
 import glob
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -45,6 +46,7 @@ from aqualvs.results.run_request import checked_index
 from aqualvs.schema import Index, NotNegative, Positive, SchemaWords, StrictPart, validated
 from aqualvs.sources.images import (
     IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
     is_image_name,
     natural_key,
     read_image,
@@ -552,6 +554,13 @@ def check_same_size(rig: Rig, found: DetectedTargets) -> None:
 
 def _read(path: Path, flags: int) -> Image:
     image = read_image(path, flags)
+    if image is None and path.suffix.lower() in VIDEO_SUFFIXES:
+        pictures = path.with_name(f"{path.stem}_%03d.png")
+        command = ["ffmpeg", "-noautorotate", "-i", str(path), "-r", "1", str(pictures)]
+        raise CalibrationError(
+            f"{path}: is a video, but this step takes pictures; photograph the target, or take a "
+            f"picture of each second of the video: {shlex.join(command)}"
+        )
     if image is None:
         raise CalibrationError(
             f"{path}: not a readable picture, cut short, or too large; remove or replace it"

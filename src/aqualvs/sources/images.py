@@ -62,6 +62,13 @@ def _discard_stderr() -> int:
 
 
 IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+VIDEO_SUFFIXES = frozenset(
+    [
+        *(".avi", ".h264", ".h265", ".m2ts", ".m4v", ".mkv", ".mov"),
+        *(".mp4", ".mpeg", ".mpg", ".mts", ".ts", ".webm", ".wmv"),
+    ]
+)
+"""Files that are videos by their names; what a user names as one may have any suffix."""
 
 
 def is_image_name(path: Path) -> bool:
