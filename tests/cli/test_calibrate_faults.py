@@ -69,14 +69,14 @@ def test_pictures_without_the_board_are_counted_in_a_refusal(folder, refused, tm
     board = folder / "board.yaml"
     said = refused("calibrate", "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
     assert "tilt" in said
-    assert "; 1 of 5 pictures could not be used (blank.png: no " in said
+    assert f"; 1 of 5 pictures could not be used with {board} (blank.png: no " in said
 
 
 def test_a_board_of_another_dictionary(folder, refused, tmp_path):
     said = refused(
         "calibrate", "camera", folder, "--board", folder / "other.yaml", "-o", tmp_path / "rig.yaml"
     )
-    assert "found in none of 4 pictures" in said
+    assert f"{folder / 'other.yaml'}: found in none of 4 pictures" in said
     assert "DICT" in said
 
 

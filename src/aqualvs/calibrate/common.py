@@ -182,6 +182,7 @@ class DetectedTargets:
     size_px: tuple[int, int]  # Width and height of every picture.
     missed: dict[str, str]  # By name of each picture in which it was not found: the reason.
     pose_notes: tuple[str, ...] = ()  # Remarks on poses that the user gave for the pictures.
+    target: str = "the target"  # Path of its file, or what it is.
     # By name of each picture that is a copy: the name of the first one. They are `missed`, too.
     copies: dict[str, str] = field(default_factory=dict)
 
@@ -355,7 +356,7 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
         Detector that is called with the name and the grey pixels of each picture, in several
         threads.
     target : str
-        Name of the target in messages, such as "board.yaml".
+        The target in messages: the path of its file, or "the board".
 
     Raises
     ------
@@ -366,7 +367,7 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
     threads = 4
     pictures = _picture_list(pictures)
     with (
-        progress(f"looking for {target}", len(pictures), unit="pictures") as tick,
+        progress(f"looking for {Path(target).name}", len(pictures), unit="pictures") as tick,
         ThreadPoolExecutor(threads) as pool,
     ):
 
@@ -409,6 +410,7 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
         tuple(one for one, _ in found),
         size_px,
         missed,
+        target=target,
         copies={names[i]: original for i, original in copies.items()},
     )
 
@@ -432,7 +434,9 @@ def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTarg
     """Find a board, given itself or by its file, in every picture; see `detect_targets`."""
     pattern = board if isinstance(board, Board) else load_board(board)
     return detect_targets(
-        pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
+        pictures,
+        lambda name, image: detect_board(image, pattern, name),
+        path_text(board, "the board"),
     )
 
 
@@ -442,14 +446,14 @@ def counting_missed(*sets: DetectedTargets) -> Iterator[None]:
     try:
         yield
     except CalibrationError as fault:
-        missed = [reason for found in sets for reason in found.missed.items()]
+        missed = [(found.target, *reason) for found in sets for reason in found.missed.items()]
         if not missed:
             raise
         n_pictures = len(missed) + sum(len(found.views) for found in sets)
-        name, why = missed[0]
+        target, name, why = missed[0]
         raise CalibrationError(
-            f"{fault}; {len(missed)} of {count_text(n_pictures, 'picture')} could not be used "
-            f"({name}: {why})"
+            f"{fault}; {len(missed)} of {count_text(n_pictures, 'picture')} could not be used with "
+            f"{target} ({name}: {why})"
         ) from fault
 
 
@@ -476,6 +480,11 @@ def read_colour(picture: Picture) -> Image:
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_COLOR)
     return picture if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+
+
+def path_text(target: object, what: str) -> str:
+    """Return a file's path for messages, or `what` if its content was given instead of a path."""
+    return str(target) if isinstance(target, str | Path) else what
 
 
 def medium_index(word: str | float | None, rig: Rig, default: float) -> float:

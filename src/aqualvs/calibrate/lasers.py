@@ -22,6 +22,7 @@ from aqualvs.calibrate.common import (
     finish,
     medium_index,
     named,
+    path_text,
     picture_paths,
     read_colour,
 )
@@ -313,16 +314,17 @@ def _detected(
         raise OptionError("--box or --board: give one of them, the file of what the lasers hit")
     if box is not None:
         markers, n_nominal = (box, None) if isinstance(box, MarkerSet) else load_box(box)
-        name = named(box, "the box")
         surfaces = box_surfaces(markers.planes, markers.points())
         default = rig.n_water
         if n_nominal is not None:
             # Air or the rig's own water, whichever is nearer to the index in the box's file.
             default = min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
         found = detect_targets(
-            pictures, lambda one, image: detect_markers(image, markers, one), name
+            pictures,
+            lambda one, image: detect_markers(image, markers, one),
+            path_text(box, "the box"),
         )
-        return _Target(name, surfaces, found, medium_index(medium, rig, default))
+        return _Target(named(box, "the box"), surfaces, found, medium_index(medium, rig, default))
     assert board is not None
     found = detect_boards(pictures, board)
     n_medium = medium_index(medium, rig, rig.n_water)

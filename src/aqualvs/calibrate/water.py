@@ -15,6 +15,7 @@ from aqualvs.calibrate.common import (
     detect_targets,
     finish,
     named,
+    path_text,
     picture_paths,
 )
 from aqualvs.calibration.detection.detection import detect_markers
@@ -105,7 +106,7 @@ def calibrate_water(
         found = detect_targets(
             pictures,
             lambda name, image: detect_markers(image, markers, name),
-            named(target, "the target"),
+            path_text(target, "the target"),
         )
         check_same_size(before, found)
         times = None

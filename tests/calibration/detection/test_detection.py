@@ -230,6 +230,16 @@ def test_a_wrong_board_is_refused_with_the_remedy(asked, words):
     assert words in detect_board(image, asked, "a.png")
 
 
+def test_a_larger_dictionary_of_the_same_family_is_named():
+    cells, _ = board_cells(charuco((26, 24), dictionary="DICT_4X4_1000"))
+    image = np.kron(60 + 140 * cells, np.ones((6, 6), np.uint8)).astype(np.uint8)
+    said = detect_board(image, charuco(), "a.png")
+    assert "are of DICT_4X4_1000: is it the file of another board?" in said
+    # Rows of markers beyond the first 250.
+    said = detect_board(image[len(image) * 9 // 10 :], charuco(), "a.png")
+    assert "markers of DICT_4X4_1000, not of DICT_4X4_250; check the dictionary" in said
+
+
 def test_an_empty_picture_is_refused():
     image = np.full((100, 140), 90, np.uint8)
     assert detect_board(image, charuco(), "a.png").startswith("no markers of DICT_4X4_250")

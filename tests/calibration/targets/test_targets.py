@@ -56,7 +56,7 @@ def test_a_chessboard_has_no_markers():
         ({"border": -0.01}, "must be positive"),
         ({"marker": 0.04}, "smaller than its square"),
         ({"marker": 0.0}, "smaller than its square"),
-        ({"dictionary": "DICT_9X9"}, "unknown; use one of DICT_4X4_100"),
+        ({"dictionary": "DICT_9X9"}, "unknown; use DICT_4X4_N"),
         ({"squares": (30, 30)}, "450 markers, but DICT_4X4_250 only 250"),
     ],
 )

@@ -53,6 +53,11 @@ def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: in
     if most >= _ENOUGH:
         return f"{read}, but not as on this board; {remedy}"
     remedy = "check its squares, marker_mm and dictionary"
+    for name in _LARGEST:
+        if name != board.dictionary and not _differs(name, board.dictionary):
+            n_all = len(read_markers(image, name))
+            if n_all >= len(markers) + _ENOUGH:
+                remedy = f"{n_all} are of {name}: is it the file of another board?"
     return f"{read}, but not as on this board ({_ids(markers)}); {remedy}"
 
 
@@ -99,9 +104,16 @@ def why_no_markers(
 
 def _no_markers(image: GreyImage, dictionary: str, n_read: int) -> str:
     for name in _LARGEST:
-        n_other = len(read_markers(image, name)) if _differs(name, dictionary) else 0
-        if n_other >= max(_ENOUGH, n_read + 1):
-            return f"{n_other} markers of {name}, not of {dictionary}; check the dictionary"
+        if name == dictionary:
+            continue
+        n_other = len(read_markers(image, name))
+        # A large dictionary holds the markers of the small ones of its family, too.
+        n_more = 1 if _differs(name, dictionary) else _ENOUGH
+        if n_other >= max(_ENOUGH, n_read + n_more):
+            return (
+                f"{n_other} markers of {name}, not of {dictionary}; check the dictionary, and "
+                "that the file is that of this target"
+            )
     what = f"no markers of {dictionary}"
     if n_read > 0:
         what = f"too few markers of {dictionary} ({n_read})"

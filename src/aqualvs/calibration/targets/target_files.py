@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from aqualvs.calibration.targets.targets import (
-    DICTIONARIES,
     Board,
     BoardKind,
     MarkerSet,
     aruco_dictionary,
+    dictionary_hint,
     dictionary_id,
 )
 from aqualvs.calibration_formats import refuse_foreign
@@ -371,9 +371,9 @@ def _unlikely_square(square_mm: float) -> str:
 
 def _known_dictionary(name: str, key: str, source: Path) -> str:
     if dictionary_id(name) is None:
-        close = difflib.get_close_matches(name.upper(), DICTIONARIES, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(DICTIONARIES)}"
-        raise CalibrationError(f"{source}: {key} is {name!r}, which is unknown; {hint}")
+        raise CalibrationError(
+            f"{source}: {key} is {name!r}, which is unknown; {dictionary_hint(name)}"
+        )
     return name
 
 

@@ -6,6 +6,7 @@ Frame `board` is OpenCV's: x right, y down, z into the board, origin at the oute
 top-left square. Lengths in metres.
 """
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -80,6 +81,24 @@ def check_enough(views: Sequence[View], n_needed: int, what: str, good: str) -> 
 def dictionary_id(name: str) -> int | None:
     """Return OpenCV's number of a marker dictionary, None for a name it does not know."""
     return DICTIONARIES.get(name.replace("h", "H"))
+
+
+def dictionary_hint(name: str) -> str:
+    """Return what to write instead of an unknown name of a marker dictionary."""
+    written = name.upper().replace("-", "_")
+    if not written.startswith("DICT_"):
+        written = f"DICT_{written}"
+    # AprilTag's own names are such as tag36h11.
+    written = written.replace("DICT_TAG", "DICT_APRILTAG_")
+    # Share of letters in common from which a name is taken for a misspelling.
+    alike = 0.85
+    if close := difflib.get_close_matches(written, DICTIONARIES, n=1, cutoff=alike):
+        return f"did you mean {close[0]}?"
+    others = [one for one in DICTIONARIES if one.split("_")[1] in ("APRILTAG", "ARUCO")]
+    return (
+        "use DICT_4X4_N, DICT_5X5_N, DICT_6X6_N or DICT_7X7_N with N = 50, 100, 250 or 1000, or "
+        f"one of {', '.join(others)}"
+    )
 
 
 class BoardKind(StrEnum):
@@ -238,9 +257,7 @@ def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
     """
     number = dictionary_id(name)
     if number is None:
-        raise CalibrationError(
-            f"dictionary {name!r} is unknown; use one of {', '.join(DICTIONARIES)}"
-        )
+        raise CalibrationError(f"dictionary {name!r} is unknown; {dictionary_hint(name)}")
     return cv2.aruco.getPredefinedDictionary(number)
 
 
