@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 from aqualvs.cli.command import importing
 from aqualvs.demo import bundled_dive
-from aqualvs.terminal import FIRST_RUN, hidden_progress, progress, rate_text, told_if_slow
+from aqualvs.terminal import FIRST_RUN, Lines, hidden_progress, progress, rate_text, told_if_slow
 
 # SciPy's linear algebra is missing here, because compiling a kernel for the first time imports it.
 NOT_FOR_A_RUN = {
@@ -54,7 +54,17 @@ def test_what_is_slow_says_what_is_waited_for(capsys) -> None:
     assert said == f"aqualvs: ready ({FIRST_RUN})\n"
 
 
-def test_progress_is_a_bar_on_terminals_and_one_line_elsewhere(monkeypatch, capsys) -> None:
+def test_progress_is_said_ever_more_rarely_where_there_is_no_terminal(capsys) -> None:
+    seconds = iter(range(101))
+    lines = Lines("dive", "of 500 frames", clock=lambda: next(seconds))
+    for _ in range(100):
+        lines.tick(2)
+    assert capsys.readouterr().err.splitlines() == [
+        f"aqualvs: dive: {2 * s} of 500 frames after {s} s" for s in (10, 20, 40, 80)
+    ]
+
+
+def test_progress_is_a_bar_on_terminals_and_lines_elsewhere(monkeypatch, capsys) -> None:
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     monkeypatch.delenv("TTY_COMPATIBLE", raising=False)
     with progress("dive", 2) as tick:

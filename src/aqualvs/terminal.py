@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from types import FrameType
@@ -59,7 +60,7 @@ class StopSignals(Closing):
 
 Tick: TypeAlias = Callable[[int], None]
 
-FIRST_RUN = "slower on a new machine, which compiles for a minute or so"
+FIRST_RUN = "the first run on a machine compiles, which takes about a minute"
 """Said until the first frame is done; compiled code is kept for the next run."""
 
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
@@ -79,10 +80,11 @@ def hidden_progress() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
-    """Show a progress bar; print one line instead where standard error is no terminal.
+    """Show a progress bar; print lines instead where standard error is no terminal.
 
-    Inside `hidden_progress`, show nothing. `n_frames` is None where it is not known. Yields what is
-    to be called with the number of frames completed since the last call.
+    The first line comes at once, the others after 10 s, 20 s, 40 s and so on: few in a log, however
+    long it takes. Inside `hidden_progress`, show nothing. `n_frames` is None where it is not known.
+    Yields what is to be called with the number of frames completed since the last call.
     """
     if _HIDDEN.get():
         yield _echo_nothing
@@ -90,19 +92,45 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
     if not _may_be_terminal():
         units = unit.removesuffix("s") if n_frames == 1 else unit
         count = unit if n_frames is None else f"{n_frames} {units}"
-        print(f"aqualvs: {label}: {count} ({FIRST_RUN})", file=sys.stderr, flush=True)
-        yield _echo_nothing
+        _say(f"{label}: {count} ({FIRST_RUN})")
+        yield Lines(label, count if n_frames is None else f"of {count}").tick
         return
 
     with _bar(label, n_frames, unit) as tick:
         yield tick
 
 
+class Lines:
+    """Progress in lines, printed when the time since the beginning has doubled.
+
+    `count`: words behind the number that is done.
+    """
+
+    def __init__(self, label: str, count: str, clock: Callable[[], float] = time.monotonic) -> None:
+        first_s = 10.0
+        self._label, self._count, self._clock = label, count, clock
+        self._began, self._due_s, self._n_done = clock(), first_s, 0
+        self._lock = threading.Lock()
+
+    def tick(self, n_done: int) -> None:
+        """Count what is done, and print it if it is time to."""
+        with self._lock:
+            self._n_done += n_done
+            spent_s = self._clock() - self._began
+            if spent_s >= self._due_s:
+                while self._due_s <= spent_s:
+                    self._due_s *= 2.0
+                _say(f"{self._label}: {self._n_done} {self._count} after {spent_s:.0f} s")
+
+
+def _say(words: str) -> None:
+    print(f"aqualvs: {words}", file=sys.stderr, flush=True)
+
+
 @contextlib.contextmanager
 def told_if_slow(label: str, after_s: float = 3.0) -> Iterator[None]:
     """Say on standard error what is waited for, if it takes longer than `after_s` seconds."""
-    words = f"aqualvs: {label} ({FIRST_RUN})\n"
-    timer = threading.Timer(after_s, lambda: print(words, end="", file=sys.stderr, flush=True))
+    timer = threading.Timer(after_s, lambda: _say(f"{label} ({FIRST_RUN})"))
     timer.start()
     try:
         yield
