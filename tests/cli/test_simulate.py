@@ -2,6 +2,7 @@
 
 import csv
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -81,15 +82,15 @@ def test_an_existing_set_of_calibration_pictures_is_kept(tmp_path, refused):
 def test_a_simulated_dive_runs_against_its_truth(tmp_path, capfd, refused):
     scenario = tmp_path / "short.yaml"
     scenario.write_text("duration_s: 0.12\nmotion: {range_mm: [500, 520]}\nwalls: [{}]\n")
-    dive = tmp_path / "dive"
+    dive = tmp_path / "a dive"
     assert main(["simulate", str(scenario), "-o", str(dive)]) == 0
     names = [".aqualvs.json", "dive.mp4", "rig.yaml", "truth.csv"]
     assert sorted(p.name for p in dive.iterdir()) == names
     assert "--overwrite" in refused("simulate", scenario, "-o", dive)
     assert main(["simulate", str(scenario), "-o", str(dive), "--overwrite"]) == 0
     said = capfd.readouterr().out
-    command = next(line for line in said.splitlines() if line.startswith("next: aqualvs "))
-    assert main([*command.removeprefix("next: aqualvs ").split(), "--no-report"]) == 0
+    command = next(line for line in said.splitlines() if line.startswith("  aqualvs run "))
+    assert main([*shlex.split(command)[1:], "--no-report"]) == 0
     assert "against the truth in 3 frames" in capfd.readouterr().out
 
 
@@ -133,8 +134,8 @@ def test_ctrl_c_leaves_a_dive_that_can_be_measured(tmp_path):
     n_rows = len((tmp_path / "truth.csv").read_text().splitlines()) - 1
     with open_source(tmp_path / "dive.mp4") as source:
         assert sum(1 for _ in source) == n_rows == n_done
-    command = next(line for line in said.splitlines() if line.startswith("next: aqualvs "))
-    assert main([*command.removeprefix("next: aqualvs ").split(), "--no-report"]) == 0
+    command = next(line for line in said.splitlines() if line.startswith("  aqualvs run "))
+    assert main([*shlex.split(command)[1:], "--no-report"]) == 0
 
 
 def test_ctrl_c_leaves_whole_folders_of_calibration_pictures(tmp_path):

@@ -7,6 +7,7 @@ The answers of a system are plain CSV, frame by frame.
 import csv
 import math
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
@@ -220,7 +221,8 @@ def make_set(
         (out / SET_FILE).write_text(content, encoding="utf-8")
     echo(f"{count_text(len(dives), 'dive')}, {count_text(total, 'frame')}: {out}")
     echo(f"what is in it, and what to write: {out / _README_MD}")
-    echo(f"next: aqualvs score mine=RESULTS --truth {out}")
+    echo("next, with the folder of your results for RESULTS:")
+    echo(f"  aqualvs {shlex.join(['score', 'mine=RESULTS', '--truth', str(out)])}")
 
 
 def chosen_dives(names: Sequence[str], n_frames: int | None) -> list[BenchmarkDive]:

@@ -2,7 +2,7 @@
 
 import itertools
 import shlex
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
 
@@ -94,12 +94,13 @@ def simulate(
         except _StoppedError as early:
             stopped = early
     echo(f"{stopped or count_text(course.n_frames, 'frame')}: {video}, truth: {truth}")
-    echo(f"next: aqualvs run {video} --rig {out / 'rig.yaml'} --truth {truth} -o {out / 'run'}")
+    run = ["run", video, "--rig", out / "rig.yaml", "--truth", truth, "-o", out / "run"]
+    commands = [[str(word) for word in run]]
     if course.nets:
-        echo(
-            f"then: aqualvs net {out / 'run'} --log {out / _LOG} --log-offset-s {LEAD_S:g}; "
-            f"true holes: {out / _HOLES}"
-        )
+        echo(f"true holes: {out / _HOLES}")
+        log = ["--log", str(out / _LOG), "--log-offset-s", f"{LEAD_S:g}"]
+        commands.append(["net", str(out / "run"), *log])
+    _echo_commands(commands, echo)
     return stop.exit_code if stopped else 0
 
 
@@ -153,10 +154,15 @@ def _simulate_calibration(
             echo(f"{early}; complete in {out}: {', '.join(complete) or 'nothing'}")
             return stop.exit_code
     echo(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
-    echo("next:")
-    for command in calibration_commands(files, out, len(rig.lasers)):
-        echo(f"  aqualvs {shlex.join(command)}")
+    _echo_commands(calibration_commands(files, out, len(rig.lasers)), echo)
     return 0
+
+
+def _echo_commands(commands: Iterable[Sequence[str]], echo: Echo) -> None:
+    """Print commands of `aqualvs`, each on a line of its own, to be pasted into a shell."""
+    echo("next:")
+    for command in commands:
+        echo(f"  aqualvs {shlex.join(command)}")
 
 
 def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
