@@ -13,6 +13,7 @@ import yaml
 from aqualvs.cli.main import main
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 from processes import children_of, on_proc
+from shell_cases import rig_file, write_video
 
 pytest.importorskip("distributed")
 
@@ -105,6 +106,16 @@ def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_
     ]
     assert same == list(RESULTS)
     assert yaml.safe_load((result / "run.yaml").read_text())["status"] == "finished"
+
+
+def test_a_recording_that_shows_no_stripes_is_finished_as_by_run(tmp_path, capfd):
+    video, run = write_video(tmp_path / "dark.mp4", 3), tmp_path / "run"
+    recorded = ["--rig", str(rig_file(tmp_path)), "-o", str(run), "--mcap"]
+    assert main(["run", str(video), *recorded]) == 0
+    words = [str(run / "dive.mcap"), "--no-report"]
+    assert main(["run", *words, "-o", str(tmp_path / "again")]) == 0
+    assert main(["batch", *words, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
+    assert "dive: 3 frames, posture in 0.0 %" in capfd.readouterr().out
 
 
 def test_a_folder_that_is_renamed_is_not_another_season(tmp_path, capfd):
