@@ -7,6 +7,7 @@ that these leave behind. Most run in this process: every new one loads its kerne
 
 import contextlib
 import dataclasses
+import functools
 import io
 import os
 import re
@@ -14,7 +15,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +62,15 @@ def arguments_of(command: Command) -> str:
     return shlex.join(command.arguments)
 
 
+@functools.cache
+def program() -> Any:
+    """The program with its commands; making it from their signatures takes a while."""
+    return typer.main.get_command(app)
+
+
 def understood(arguments: list[str]) -> None:
     """Parse as the command line does, without running anything."""
-    command, rest = typer.main.get_command(app), list(arguments)
+    command, rest = program(), list(arguments)
     while hasattr(command, "commands"):
         command = command.commands[rest.pop(0)]
     command.make_context(command.name, rest)
@@ -73,7 +79,7 @@ def understood(arguments: list[str]) -> None:
 def examples() -> list[Command]:
     """The example in the help of every command."""
     found = []
-    group: Any = typer.main.get_command(app)
+    group = program()
     pairs = [(name, one) for name, one in group.commands.items()]
     for name, one in list(pairs):
         pairs += [(f"{name} {k}", v) for k, v in getattr(one, "commands", {}).items()]
@@ -120,7 +126,7 @@ def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("user")
     with pytest.MonkeyPatch.context() as patch:
         # Rendering would be most of the time: small pictures of one ray a pixel, and few of them.
-        patch.setattr(dive, "Renderer", partial(Renderer, samples=1))
+        patch.setattr(dive, "Renderer", functools.partial(Renderer, samples=1))
         patch.setattr(simulate, "load_scenario", few_frames)
         patch.setattr(simulate, "example_rig", small_rig)
         leave_bare_lenses_out(patch)

@@ -40,7 +40,7 @@ def _dark(view: NetView, strands: Strands, which: BoolArray) -> NetView:
 
 
 def _gaps(table: FloatArray) -> Gaps:
-    return Gaps(table[:, 0].astype(int), table[:, 1:3], table[:, 3:5] == 1.0, table[:, 5])
+    return Gaps(table[:, 0].astype(int), table[:, 1:3].copy(), table[:, 3:5] == 1.0, table[:, 5])
 
 
 def view_at(

@@ -276,10 +276,17 @@ def peaks(
     return rest
 
 
+def as_found(*parts: FloatArray) -> FloatArray:
+    """Tables of peaks in one, in rows longer than it, as a scanner has them: kernels are compiled
+    for such."""
+    n = sum(part.shape[1] for part in parts)
+    return np.hstack([*parts, np.zeros((N_MEASURES, 1))])[:, :n]
+
+
 def test_few_lines_are_told_from_a_crowd_of_paint_as_green() -> None:
     # Caustics on twine: much paint that lowers V as far as lines do, and hardly U.
     paint, lines = peaks(14000, 0.01, -0.15, (0.01, 0.06)), peaks(120, -0.12, -0.17, (0.03, 0.04))
-    table = np.hstack([paint, lines])
+    table = as_found(paint, lines)
     crowd = learn_paint(table[:, ::48], 1900.0 / 48.0)
     assert crowd is not None
     assert abs(crowd.u - 0.01) < 0.02
@@ -293,10 +300,10 @@ def test_few_lines_are_told_from_a_crowd_of_paint_as_green() -> None:
 
 def test_lines_are_no_paint_however_many_peaks_they_make() -> None:
     # Of one net before a wall: as many as the lasers can make.
-    assert learn_paint(peaks(1900, -0.3, -0.3, (0.02, 0.02)), 1900.0) is None
+    assert learn_paint(as_found(peaks(1900, -0.3, -0.3, (0.02, 0.02))), 1900.0) is None
     # Mixed with growth, whose colour differs: no one colour.
     growth = peaks(3000, -0.05, -0.12, (0.06, 0.03), seed=2)
-    mixed = np.hstack([growth, peaks(2500, -0.22, -0.16, (0.05, 0.03))])
+    mixed = as_found(growth, peaks(2500, -0.22, -0.16, (0.05, 0.03)))
     assert learn_paint(mixed, 1900.0) is None
 
 
@@ -359,12 +366,10 @@ def test_some_dashes_may_have_kept_their_colour(green_share, is_colour_evidence)
 
 def test_an_overexposed_line_shows_less_of_its_colour() -> None:
     # As on rendered stripes: of 0.24 levels of chroma at 170 of luma, 0.13 are left at 220.
-    table = np.hstack(
-        [
-            peaks(400, -0.15, -0.19, (0.02, 0.02)),
-            peaks(300, -0.08, -0.1, (0.02, 0.02), top=220.0),
-            peaks(300, 0.0, -0.03, (0.02, 0.02), seed=3),
-        ]
+    table = as_found(
+        peaks(400, -0.15, -0.19, (0.02, 0.02)),
+        peaks(300, -0.08, -0.1, (0.02, 0.02), top=220.0),
+        peaks(300, 0.0, -0.03, (0.02, 0.02), seed=3),
     )
     colour = learn_colour(table, LaserColour.GREEN, None)
     assert colour is not None

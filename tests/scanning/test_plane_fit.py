@@ -58,11 +58,11 @@ def fit(
     _, per_px, laser = stripes(m)
     sigma = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(laser),))
     return fit_robust(
-        points[rows],
-        per_px[rows],
+        points[rows].copy(),
+        per_px[rows].copy(),
         sigma[rows].copy(),
-        laser[rows],
-        np.tile(ALONG, 3)[rows],
+        laser[rows].copy(),
+        np.tile(ALONG, 3)[rows].copy(),
         start=m,
         shared=own(shared_px, len(laser[rows])),
     )

@@ -480,7 +480,7 @@ def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
     for chain in chains:
         after = _following(chain, 1, peaks.line, peaks.position, peaks.height, first_of, used)
         before = _following(
-            chain[::-1], -1, peaks.line, peaks.position, peaks.height, first_of, used
+            chain[::-1].copy(), -1, peaks.line, peaks.position, peaks.height, first_of, used
         )
         longer.append(np.concatenate([before[::-1], chain, after]))
     return longer
