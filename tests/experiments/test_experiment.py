@@ -5,23 +5,30 @@ from functools import cached_property, partial, partialmethod
 from itertools import chain
 
 import pytest
-from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from aqualvs.experiments import ablation_stages, growth_and_sun, page, sea, water_index
+from aqualvs.experiments import ablation_stages, growth_and_sun, mesh_filter, page, sea, water_index
+from aqualvs.experiments import laboratory as tank
 from aqualvs.experiments.experiment import MODULES, experiment
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.experiments.mesh_filter import PrecisionRecall
 from aqualvs.experiments.page import save_outcome
 from aqualvs.follow import sensor_model
 from aqualvs.follow.case import Trials
+from aqualvs.report import figure_style
 from aqualvs.report.figure_style import STYLE
 from aqualvs.simulation import dive
+from aqualvs.simulation.calibration_set import SetSize
 from aqualvs.simulation.render import Renderer
 from camera_cases import half_size_rig
 from dome_cases import leave_bare_lenses_out
-from whole import WHOLE
+from whole import WHOLE, part_of
 
-N_FRAMES = 5
+N_FRAMES = 4
+# Of the frames of the net before the wall that are compared with their true points, two; frame 8 is
+# drawn.
+JUDGED = (2, 8)
 # Bars for full pictures and whole dives; all others are reached by these, too.
 FOR_FULL_PICTURES = {
     "changes of the medium noticed as such, the dive into the water among them",
@@ -39,8 +46,9 @@ class BriefLaboratory(Laboratory):
         return half_size_rig()
 
     def dive(self, scenario, rig=None, *, recording=None, point_frames=()):
-        if not point_frames and scenario.n_frames > N_FRAMES:
-            scenario = replace(scenario, fps=N_FRAMES / scenario.duration)
+        n_frames = max(N_FRAMES, max(point_frames, default=0) + 1)
+        if scenario.n_frames > n_frames:
+            scenario = replace(scenario, fps=n_frames / scenario.duration)
         return super().dive(scenario, rig, recording=recording, point_frames=point_frames)
 
 
@@ -51,24 +59,33 @@ def laboratory(tmp_path_factory):
         # One ray for each pixel: rendering would be most of the time.
         for module in (dive, growth_and_sun, sensor_model):
             patch.setattr(module, "Renderer", partial(Renderer, samples=1))
+        patch.setattr(tank, "_SIZE", SetSize(camera=6, dome=6, box=2, index=1, dive=0))
         leave_bare_lenses_out(patch)
         yield BriefLaboratory(tmp_path_factory.mktemp("tank"))
 
 
+def _canvas_without_layout(width_in, height_in):
+    # A layout has everything drawn twice.
+    figure = Figure(figsize=(width_in, height_in))
+    FigureCanvasAgg(figure)
+    return figure
+
+
 @pytest.fixture
 def plain_figures(monkeypatch):
-    """Figures in one format, coarsely laid out: `test_command.py` writes others, as they are."""
+    """Figures in one format, coarse, not laid out: `test_command.py` writes others, as they are."""
     monkeypatch.setattr(page, "_FORMATS", {"png": {}})
     monkeypatch.setattr(page, "STYLE", {**STYLE, "savefig.dpi": 60})
-    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
+    monkeypatch.setattr(figure_style, "new_canvas", _canvas_without_layout)
 
 
 @pytest.fixture
 def brief_loops(monkeypatch):
     """A shorter way along the net: test_closed_loop.py goes the same one for a minute."""
-    monkeypatch.setattr(Trials, "follow", partialmethod(Trials.follow, 40.0))
-    # A picture every two seconds of a dive at sea.
-    monkeypatch.setattr(sea, "_SETUP", sea._SETUP._replace(every=50))
+    monkeypatch.setattr(Trials, "follow", partialmethod(Trials.follow, 40.0 if WHOLE else 20.0))
+    monkeypatch.setattr(sea, "_VEHICLES", dict(part_of([*sea._VEHICLES.items()])))
+    # A picture every two seconds of half a dive at sea.
+    monkeypatch.setattr(sea, "_SETUP", sea._SETUP._replace(every=50, seconds=20.0))
 
 
 @pytest.fixture
@@ -87,8 +104,9 @@ def test_an_experiment_gives_its_results(
     laboratory, plain_figures, brief_loops, few_waters, tmp_path, monkeypatch, name
 ):
     monkeypatch.setattr(growth_and_sun, "_SHOWN", N_FRAMES // 2)
-    # Every fourth set of parameters that is tried.
-    few = {kind: sets[::4] for kind, sets in ablation_stages._KINDS.items()}
+    monkeypatch.setattr(mesh_filter, "_JUDGED", JUDGED)
+    # Every eighth set of parameters that is tried.
+    few = {kind: sets[:: 4 if WHOLE else 8] for kind, sets in ablation_stages._KINDS.items()}
     monkeypatch.setattr(ablation_stages, "_KINDS", few)
     found = experiment(name)
     record = save_outcome(found, found.run(laboratory), tmp_path)
