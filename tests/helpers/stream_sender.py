@@ -208,20 +208,22 @@ def in_order(pictures, n_again):
     yield from enumerate(pictures)
 
 
+@contextlib.contextmanager
 def to_port(port):
-    outlet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    n_sent = 0
+    """Give what sends a datagram to a port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outlet:
+        n_sent = 0
 
-    def send(datagram):
-        nonlocal n_sent
-        if n_sent % LOOK_EVERY == 0:
-            while waiting_bytes(port) > MAX_WAITING_BYTES:
-                time.sleep(0.005)
-        n_sent += 1
-        with contextlib.suppress(ConnectionRefusedError):
-            outlet.sendto(datagram, (LOOPBACK, port))
+        def send(datagram):
+            nonlocal n_sent
+            if n_sent % LOOK_EVERY == 0:
+                while waiting_bytes(port) > MAX_WAITING_BYTES:
+                    time.sleep(0.005)
+            n_sent += 1
+            with contextlib.suppress(ConnectionRefusedError):
+                outlet.sendto(datagram, (LOOPBACK, port))
 
-    return send
+        yield send
 
 
 def waiting_bytes(port):
@@ -280,7 +282,7 @@ class RtspServer:
         return send
 
 
-def parse_options():
+def parse_options(arguments=None):
     parser = argparse.ArgumentParser()
     parser.add_argument("clips", nargs="+")
     parser.add_argument("--kind", choices=("rtp", "mpegts", "bare"), default="rtp")
@@ -298,7 +300,7 @@ def parse_options():
     parser.add_argument(
         "--hold", type=int, nargs="*", default=[], help="before these frames, for a line of input"
     )
-    return parser.parse_args()
+    return parser.parse_args(arguments)
 
 
 def main():
@@ -309,7 +311,8 @@ def main():
         print(json.dumps(server.serve()), flush=True)
     else:
         print("ready", flush=True)
-        print(json.dumps(send_clips(options, to_port(options.port))), flush=True)
+        with to_port(options.port) as send:
+            print(json.dumps(send_clips(options, send)), flush=True)
 
 
 if __name__ == "__main__":
