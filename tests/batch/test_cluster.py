@@ -12,6 +12,7 @@ import pytest
 
 from aqualvs.cli.main import main
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
+from whole import WHOLE
 
 distributed = pytest.importorskip("distributed")
 
@@ -39,27 +40,40 @@ def begun(command, folder):
 def await_worker(address, name, said):
     deadline = time.monotonic() + TIMEOUT_S
     with distributed.Client(address, timeout=TIMEOUT_S, set_as_default=False) as client:
-        while name not in {w["name"] for w in client.scheduler_info()["workers"].values()}:
+        while name not in names_of_workers(client):
             assert time.monotonic() < deadline, said.read_text()
             time.sleep(0.05)
 
 
-@pytest.fixture
-def scheduler(tmp_path):
-    """Address of a scheduler, and what begins a worker for it."""
-    folder = tmp_path / "scheduler"
-    folder.mkdir()
+def names_of_workers(client):
+    return {worker["name"] for worker in client.scheduler_info()["workers"].values()}
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """Address of a scheduler."""
+    folder = tmp_path_factory.mktemp("scheduler")
     told = folder / "scheduler.json"
     command = [*DASK, "scheduler", "--host", "127.0.0.1", "--port", "0", *QUIET]
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(begun([*command, "--scheduler-file", str(told)], folder))
+    with begun([*command, "--scheduler-file", str(told)], folder):
         deadline = time.monotonic() + TIMEOUT_S
         while not told.exists() or not told.read_text().endswith("}"):
             assert time.monotonic() < deadline, (folder / "said.txt").read_text()
             time.sleep(0.05)
-        address = json.loads(told.read_text())["address"]
+        yield json.loads(told.read_text())["address"]
 
-        def worker(name, program=DASK):
+
+@pytest.fixture
+def worker(address, tmp_path):
+    """What begins a worker for the scheduler, of which it has none before."""
+    deadline = time.monotonic() + TIMEOUT_S
+    with distributed.Client(address, timeout=TIMEOUT_S, set_as_default=False) as client:
+        while names_of_workers(client):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    with contextlib.ExitStack() as stack:
+
+        def begin(name, program=DASK):
             place = tmp_path / name
             place.mkdir()
             command = [*program, "worker", address, "--nthreads", "1", "--no-nanny", *QUIET]
@@ -67,14 +81,14 @@ def scheduler(tmp_path):
             await_worker(address, name, place / "said.txt")
             return process
 
-        yield address, worker
+        yield begin
 
 
 @pytest.fixture(scope="module")
 def season(tmp_path_factory):
     folder = tmp_path_factory.mktemp("season")
     for name in ("north", "south"):
-        demo_dive(folder / f"{name}.mp4", 36, 6)
+        demo_dive(folder / f"{name}.mp4", 24, 6)
     (folder / "rig.yaml").write_bytes((DEMO / "rig.yaml").read_bytes())
     return folder
 
@@ -93,18 +107,21 @@ def results(out):
 
 @pytest.fixture(scope="module")
 def near(season, tmp_path_factory):
-    """What a worker of this machine gives."""
+    """What runs on this machine give."""
     out = tmp_path_factory.mktemp("near")
-    assert batch(season, out, "--workers", "1") == 0
+    for name in ("north", "south"):
+        words = ["run", str(season / f"{name}.mp4"), "--rig", str(season / "rig.yaml")]
+        words += ["-o", str(out / "dives" / name), "--no-report", "--net", "--workers", "1"]
+        assert main(words) == 0
     return results(out)
 
 
-def test_workers_may_come_and_go_and_give_what_those_of_this_machine_give(
-    scheduler, season, near, tmp_path
+def test_workers_may_come_and_go_and_give_what_runs_on_this_machine_give(
+    address, worker, season, near, tmp_path
 ):
-    address, worker = scheduler
     first = worker("one")
-    worker("two")
+    if WHOLE:
+        worker("two")
     out, said = tmp_path / "out", tmp_path / "said.txt"
     command = [sys.executable, "-m", "aqualvs", "batch", str(season), "-o", str(out)]
     command += ["--no-report", "--net", "--scheduler", address]
@@ -122,8 +139,8 @@ def test_workers_may_come_and_go_and_give_what_those_of_this_machine_give(
     assert [name for name in near if far[name] != near[name]] == []
 
 
-def test_a_scheduler_without_workers_is_said(scheduler, season, tmp_path, capsys):
-    address, _ = scheduler
+@pytest.mark.usefixtures("worker")
+def test_a_scheduler_without_workers_is_said(address, season, tmp_path, capsys):
     assert batch(season, tmp_path / "out", "--scheduler", address) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
@@ -131,8 +148,7 @@ def test_a_scheduler_without_workers_is_said(scheduler, season, tmp_path, capsys
     assert "worker" in said
 
 
-def test_a_worker_without_aqualvs_is_said(scheduler, season, tmp_path, capsys):
-    address, worker = scheduler
+def test_a_worker_without_aqualvs_is_said(address, worker, season, tmp_path, capsys):
     lacks = "import sys; sys.modules['aqualvs'] = None; from dask.__main__ import main; main()"
     worker("bare", [sys.executable, "-c", lacks])
     assert batch(season, tmp_path / "out", "--scheduler", address) == 2

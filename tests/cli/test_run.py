@@ -204,20 +204,20 @@ def test_missing_arguments(refused, dive):
 
 @pytest.fixture(scope="module")
 def long_dive(tmp_path_factory):
-    """A dive of 20000 pictures, links to one: it lasts until it is stopped."""
+    """A dive of 8000 pictures, links to one: it lasts until it is stopped."""
     folder = tmp_path_factory.mktemp("long") / "images"
     folder.mkdir()
     picture = folder.with_name("wall.png")
     cv2.imwrite(str(picture), wall_picture(example_rig(), 0.5))
-    for i in range(20_000):
+    for i in range(8_000):
         os.link(picture, folder / f"{i}.png")
     return folder
 
 
 @contextlib.contextmanager
-def under_way(source, rig, out, *, limit=None):
+def under_way(source, rig, out, *more, limit=None):
     """Start a run as its own process and wait until it has written 20 rows."""
-    arguments = [*PROGRAM, "run", str(source), "--rig", str(rig), "-o", str(out)]
+    arguments = [*PROGRAM, "run", str(source), "--rig", str(rig), "-o", str(out), *more]
     process = subprocess.Popen(
         arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=limit
     )
@@ -239,9 +239,14 @@ def n_points_rows(folder):
 
 
 @pytest.mark.parametrize(("number", "code"), part_of([(signal.SIGTERM, 143), (signal.SIGINT, 130)]))
-def test_a_stopped_run_is_complete(long_dive, rig, tmp_path, number, code):
+def test_a_run_is_left_alone_while_under_way_and_complete_when_stopped(
+    long_dive, rig, tmp_path, refused, number, code
+):
     out = tmp_path / "out"
     with under_way(long_dive, rig, out) as process:
+        assert "still writing" in refused("report", out)
+        again = ("run", long_dive, "--rig", rig, "-o", out, "--overwrite", "--workers", "1")
+        assert "still writing" in refused(*again)
         process.send_signal(number)
         said, complaint = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == code
@@ -253,11 +258,22 @@ def test_a_stopped_run_is_complete(long_dive, rig, tmp_path, number, code):
     assert not (out / "points.arrows").exists()
 
 
-def test_a_killed_run_can_be_read_and_completed(long_dive, rig, tmp_path, capsys):
-    out = tmp_path / "out"
-    with under_way(long_dive, rig, out) as process:
+@pytest.fixture(scope="module")
+def killed(long_dive, tmp_path_factory):
+    """The folder of a run that was killed, the processes that it had, and those that live on."""
+    folder = tmp_path_factory.mktemp("killed")
+    with under_way(long_dive, rig_file(folder), folder / "out") as process:
+        others = children_of(process.pid) if os.path.isdir("/proc") else []
         process.kill()
         process.wait()
+        left = still_there(others, 20.0)
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+    return folder / "out", others, left
+
+
+def test_a_killed_run_can_be_read_and_completed(killed, capsys):
+    out, _, _ = killed
     table = (out / "posture.csv").read_text()
     assert table.endswith("\n")
     measured = {int(row["frame"]) for row in rows(out)}
@@ -281,14 +297,8 @@ def test_a_killed_run_can_be_read_and_completed(long_dive, rig, tmp_path, capsys
 
 @on_proc
 @pytest.mark.skipif(n_cores() < 2, reason="one core is one process")
-def test_the_processes_of_a_killed_run_end_with_it(long_dive, rig, tmp_path):
-    with under_way(long_dive, rig, tmp_path / "out") as process:
-        others = children_of(process.pid)
-        process.kill()
-        process.wait()
-        left = still_there(others, 20.0)
-        for pid in left:
-            os.kill(pid, signal.SIGKILL)
+def test_the_processes_of_a_killed_run_end_with_it(killed):
+    _, others, left = killed
     assert len(others) >= 2
     assert left == []
 
@@ -298,20 +308,13 @@ def test_the_processes_of_a_killed_run_end_with_it(long_dive, rig, tmp_path):
 def test_ctrl_c_reaches_the_processes_of_a_run_and_does_nothing_there(long_dive, rig, tmp_path):
     """A terminal sends it to all of them; what they have measured is written."""
     out = tmp_path / "out"
-    with under_way(long_dive, rig, out) as process:
+    with under_way(long_dive, rig, out, "--no-report") as process:
         for pid in [*children_of(process.pid), process.pid]:
             os.kill(pid, signal.SIGINT)
         _, complaint = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 130
     assert complaints(complaint) == []
     assert run_file(out)["status"] == "interrupted"
-
-
-def test_a_run_under_way_is_left_alone(long_dive, rig, tmp_path, refused):
-    out = tmp_path / "out"
-    with under_way(long_dive, rig, out):
-        assert "still writing" in refused("report", out)
-        assert "still writing" in refused("run", long_dive, "--rig", rig, "-o", out, "--overwrite")
 
 
 def test_a_full_disk_is_said_and_what_is_there_can_be_read(long_dive, rig, tmp_path, capsys):
@@ -321,7 +324,8 @@ def test_a_full_disk_is_said_and_what_is_there_can_be_read(long_dive, rig, tmp_p
     def limit():
         resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000))
 
-    with under_way(long_dive, rig, out, limit=limit) as process:
+    alone = ("--no-report", "--workers", "1")
+    with under_way(long_dive, rig, out, *alone, limit=limit) as process:
         _, complaint = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 2
     assert len(complaints(complaint)) == 1
