@@ -22,8 +22,10 @@ from aqualvs.results.summary import compare_with_truth
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
 from dome_cases import leave_bare_lenses_out
 from panel_cases import small_rig
+from whole import WHOLE
 
-SIZE = SetSize(camera=8, dome=8, box=3, index=1, dive=0)
+N_BOARDS = 6
+SIZE = SetSize(camera=N_BOARDS, dome=N_BOARDS, box=2, index=1, dive=0)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,8 @@ def test_every_step_says_what_it_used(calibrated):
     """Pictures, corners and the residual: of the camera, then of the dome."""
     out, _, _, _ = calibrated
     said = (out / "said.txt").read_text(encoding="utf-8")
-    told = re.findall(r"^8 pictures, (\d+) corners, residual (0\.\d+) px \(rms\)$", said, re.M)
+    words = rf"^{N_BOARDS} pictures, (\d+) corners, residual (0\.\d+) px \(rms\)$"
+    told = re.findall(words, said, re.M)
     assert len(told) == 2
     for n_corners, rms_px in told:
         assert int(n_corners) > 100
@@ -65,7 +68,7 @@ def test_every_step_says_what_it_used(calibrated):
 def test_the_camera_is_the_true_one(calibrated):
     out, files, _, _ = calibrated
     rig, truth = load_rig(out / "rig.yaml"), load_rig(files.rig)
-    # 360 pixels and eight pictures: 0.2 px of 408 is three of the sigmas that the solve states.
+    # 360 pixels and six pictures: 0.2 px of 408 is three of the sigmas that the solve states.
     assert rig.lens.fx == pytest.approx(truth.lens.fx, rel=1e-3)
     assert rig.lens.fy == pytest.approx(truth.lens.fy, rel=1e-3)
 
@@ -138,12 +141,12 @@ def test_red_and_blue_lasers_are_calibrated_and_keep_their_wavelength(in_colour,
     # Red and blue are half made of chroma of half the size; the worst laser's sigma is 0.5 mm.
     assert_true_planes(found, load_rig(calibrated[1].rig), offset_mm=1.0)
     assert main(["check", str(folder / "rig.yaml"), "--against", str(folder / "rig.yaml")]) == 0
-    # A second time the rig knows, and the wavelength stays.
-    command[command.index(str(folder / "before.yaml"))] = str(folder / "rig.yaml")
-    assert main(command) == 0
-    assert [laser.wavelength_nm for laser in load_rig(folder / "rig.yaml").lasers] == [
-        wavelength
-    ] * 3
+    if WHOLE or wavelength == 650.0:
+        # A second time the rig knows, and the wavelength stays.
+        command[command.index(str(folder / "before.yaml"))] = str(folder / "rig.yaml")
+        assert main(command) == 0
+        again = [laser.wavelength_nm for laser in load_rig(folder / "rig.yaml").lasers]
+        assert again == [wavelength] * 3
 
 
 def test_lasers_of_which_nothing_is_said_stay_so(calibrated):
@@ -192,9 +195,9 @@ def test_the_functions_find_what_the_commands_find(calibrated):
         assert found.plane.offset == pytest.approx(
             written.plane.offset, abs=0.1 * figures.sigma_offset
         )
-    assert list(camera.left_out) == ["picture 8"]
-    assert camera.left_out["picture 8"]
-    assert list(camera.residuals_px) == [f"picture {i}" for i in range(8)]
+    assert list(camera.left_out) == [f"picture {N_BOARDS}"]
+    assert camera.left_out[f"picture {N_BOARDS}"]
+    assert list(camera.residuals_px) == [f"picture {i}" for i in range(N_BOARDS)]
     assert 0.0 < camera.rms_px < 0.3
     for one in (camera, dome, lasers):
         n = len(one.uncertainty.names)
