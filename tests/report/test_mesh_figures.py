@@ -1,5 +1,6 @@
 """Figures of a run after the paper's 13 and 14."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -7,12 +8,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import yaml
+from matplotlib.figure import Figure
 from pyarrow import parquet
 
 from aqualvs.errors import OptionError, OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.report import mesh_figures
 from aqualvs.report.figure_style import save_figures
 from aqualvs.report.mesh_figures import Reflections, draw_figures, figures
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
@@ -95,6 +98,20 @@ def test_the_frame_and_laser_that_show_most_are_drawn(tmp_path: Path) -> None:
     assert share_of(figure_14, BLUE) > 1e-3
 
 
+@pytest.fixture
+def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files without pictures, for tests of what is said of them."""
+
+    def save(drawn: Mapping[str, Figure], folder: Path, dpi: float) -> list[Path]:
+        paths = [folder / f"{name}.png" for name in drawn]
+        for path in paths:
+            path.write_bytes(b"")
+        return paths
+
+    monkeypatch.setattr(mesh_figures, "save_figures", save)
+
+
+@pytest.mark.usefixtures("blank_pictures")
 def test_pictures_of_others_stay(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
@@ -109,12 +126,14 @@ def test_pictures_of_others_stay(tmp_path: Path) -> None:
     figures(write_run(tmp_path), out, lambda _: None, overwrite=True)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_chosen_frame_and_laser_are_drawn(tmp_path: Path) -> None:
     told: list[str] = []
     figures(write_run(tmp_path), tmp_path / "out", told.append, frame=3, laser="lower")
     assert told[0].startswith("frame 3, laser lower: 210 reflections")
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_parameters_come_from_a_target_file(tmp_path: Path) -> None:
     target = tmp_path / "net.yaml"
     target.write_text("mesh_filter: {r_min_mm: 40, r_max_mm: 60}\n")
@@ -174,7 +193,7 @@ def reflections(in_laser: FloatArray, net: bool) -> Reflections:
 @pytest.mark.parametrize("points", [np.empty((0, 2)), strands(1)[:1], box(50)])
 def test_little_to_see_is_drawn_too(tmp_path: Path, points: FloatArray) -> None:
     written = save_figures(
-        draw_figures(reflections(points, False), MeshFilterOptions()), tmp_path, dpi=220
+        draw_figures(reflections(points, False), MeshFilterOptions()), tmp_path, dpi=100
     )
     assert all(path.stat().st_size > 5000 for path in written)
 
@@ -203,6 +222,7 @@ def threshold_run(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_run_with_the_threshold_shows_every_bright_pixel(tmp_path: Path) -> None:
     told: list[str] = []
     figures(threshold_run(tmp_path), tmp_path / "out", told.append)
