@@ -1,7 +1,6 @@
 """Streams from a process of its own, on loopback: all that arrives whole, and nothing else."""
 
 import hashlib
-import json
 import os
 import socket
 import subprocess
@@ -131,12 +130,17 @@ def udp_listener():
         yield listener
 
 
-def sender(*clips, port, **options):
-    """Start the sender; `communicate` it."""
-    command = [sys.executable, str(SENDER), *map(str, clips), "--port", str(port)]
+def words_of(clips, port, options):
+    words = [*map(str, clips), "--port", str(port)]
     for name, value in options.items():
-        command.append("--" + name.replace("_", "-"))
-        command += [] if value is True else [str(value)]
+        words.append("--" + name.replace("_", "-"))
+        words += [] if value is True else [str(value)]
+    return words
+
+
+def sender(*clips, port, **options):
+    """Start the sender in a process of its own, which waits where it is told to."""
+    command = [sys.executable, str(SENDER), *words_of(clips, port, options)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
@@ -149,10 +153,10 @@ def go_on(process):
 
 
 def send(*clips, port, **options):
-    """Send clips and return what the sender tells."""
-    with sender(*clips, port=port, **options) as process:
-        text, _ = process.communicate(timeout=2 * TIMEOUT_S)
-    return json.loads(text.splitlines()[-1])
+    """Send clips from this process and return what the sender tells."""
+    asked = stream_sender.parse_options(words_of(clips, port, options))
+    with stream_sender.to_port(port) as outlet:
+        return stream_sender.send_clips(asked, outlet)
 
 
 @pytest.mark.parametrize(("name", "size", "n"), [("sd", SD, 50), ("hd", HD, 30)])
