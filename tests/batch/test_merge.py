@@ -1,19 +1,23 @@
 """A dive that was cut and joined is, byte for byte, the one that was run as a whole."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import yaml
 
+import batch_cases
 from aqualvs.batch.dataset import OF_DIVE, holds, read_manifest
 from aqualvs.batch.dives import DiveState
 from aqualvs.batch.scheduler import Scheduler, WorkersLostError, look
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.pipeline import run
 from aqualvs.results.run_request import scanner_options
-from batch_cases import DEMO, RESULTS, InlineWorkers, Listener, demo_dive, without_times, work_for
+from batch_cases import DEMO, RESULTS, InlineWorkers, Listener, demo_dive, without_times
 from shell_cases import cut_after, damage_frame, destroy_frame, rig_file, write_video
 
-N, GROUP = 24, 6
+N, GROUP = 16, 4
+work_for = partial(batch_cases.work_for, piece_frames=GROUP)
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +73,8 @@ def test_what_is_watched_over_the_dive_is_in_the_summary(serial):
     """Else the test above would compare nothing."""
     summary = yaml.safe_load((serial / "run.yaml").read_text())["summary"]
     assert summary["laser_agreement"]["n_frames"] > 5
-    assert summary["net_check"]["n_frames"] >= 5
-    assert summary["n_valid"] > 20
+    assert summary["net_check"]["n_frames"] >= 4
+    assert summary["n_valid"] > N - 4
 
 
 @pytest.mark.parametrize("piece_frames", [7, 1000])

@@ -16,7 +16,7 @@ from aqualvs.net_survey.command import NetSource, net_of_run
 from aqualvs.nets.target_file import NetRequest, net_request
 from aqualvs.results.folder import NET_FILES
 from aqualvs.results.run_request import scanner_options
-from batch_cases import DEMO, InlineWorkers, Listener, demo_dive, work_for
+from batch_cases import InlineWorkers, Listener, demo_dive, work_for
 from net_app_cases import leave_maps_blank
 
 BARE = NetRequest()
@@ -162,7 +162,7 @@ def test_a_log_that_cannot_be_used_leaves_the_dive_measured(finished, tmp_path):
 
 
 def test_a_dive_without_a_net_has_none_to_tell_of(tmp_path):
-    source = DEMO / "dive.mp4"
+    source = demo_dive(tmp_path / "dive.mp4", 12)
     scanner = scanner_options("solid", "ridge", "none", "robust")
     work = work_for(tmp_path, source, piece_frames=1000, net=BARE, target="solid", scanner=scanner)
     record, _, lines = season(work)

@@ -27,8 +27,11 @@ from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.surfaces import TargetKind
 from live_cases import demo_rig, demo_samples
 from repository import ROOT
+from whole import WHOLE
 
 FEW = FrameWindow(0, 12)
+# Of the bundled dive.
+N = 150 if WHOLE else 110
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +43,9 @@ def demo():
 
 @pytest.fixture(scope="module")
 def whole(demo, tmp_path_factory):
-    """A run of the whole bundled dive, with its recording."""
+    """A run of the bundled dive, with its recording."""
     out = tmp_path_factory.mktemp("whole") / "out"
-    run(
-        RunRequest(
-            source=str(demo / "dive.mp4"), rig=demo / "rig.yaml", out=out, mcap=True, report=False
-        )
-    )
+    again(demo / "dive.mp4", out, demo / "rig.yaml", mcap=True, frames=FrameWindow(0, N))
     return out
 
 
@@ -80,7 +79,7 @@ def rows(out):
 
 def test_a_recorded_run_replays_bit_for_bit(whole, tmp_path):
     result = again(whole / "dive.mcap", tmp_path / "out")
-    assert result.summary.n_frames == 150
+    assert result.summary.n_frames == N
     assert same_results(whole, tmp_path / "out")
     said = yaml.safe_load((tmp_path / "out" / "run.yaml").read_text())
     assert said["options"]["rig_file"] is None
@@ -176,7 +175,8 @@ def test_another_water_is_as_for_the_video(whole, demo, tmp_path):
 
 def test_no_dome_is_mostly_as_for_the_video(whole, demo, tmp_path):
     again(whole / "dive.mcap", tmp_path / "replay", no_dome=True)
-    again(demo / "dive.mp4", tmp_path / "video", demo / "rig.yaml", no_dome=True)
+    window = FrameWindow(0, N)
+    again(demo / "dive.mp4", tmp_path / "video", demo / "rig.yaml", no_dome=True, frames=window)
     # Without its dome the rig refuses most frames, for the lasers disagree. Its bands are others
     # than those the recording's stripes were looked for in, so a plane found by few readings may
     # be another.
