@@ -30,6 +30,7 @@ from aqualvs.workers.run_frames import WaterFollowingScanner
 from batch_cases import DEMO, RESULTS, InlineWorkers, Listener, demo_dive, without_times, work_for
 from field_cases import FIELDS, interlaced_rig, woven_dive
 from shell_cases import destroy_frame
+from whole import part_of
 
 N_PICTURES, GROUP = 12, 3
 _BOTTOM = replace(FIELDS, first_field="bottom")
@@ -72,8 +73,13 @@ def same(one, other):
     return [n for n in RESULTS if without_times(one / n) == without_times(other / n)]
 
 
-@pytest.mark.parametrize("shutter", [FIELDS, _BOTTOM], ids=["top", "bottom"])
-@pytest.mark.parametrize("coded", [True, False], ids=["interlaced", "progressive"])
+@pytest.mark.parametrize(
+    ("shutter", "coded"),
+    part_of([(FIELDS, True), (FIELDS, False), (_BOTTOM, False), (_BOTTOM, True)]),
+    ids=lambda one: (
+        ("progressive", "interlaced")[one] if isinstance(one, bool) else one.first_field
+    ),
+)
 def test_each_field_is_measured_at_its_own_time(tmp_path, shutter, coded):
     """Progressive: a capture program that took the pictures for whole, and mixed their colours."""
     dive = woven_dive(tmp_path / "dive.mp4", N_PICTURES, shutter=shutter, coded=coded)
@@ -111,7 +117,7 @@ def test_whole_pictures_have_no_column_of_fields(tmp_path):
 def test_processes_find_what_one_finds(tmp_path, dive, rig, window):
     alone = measured(dive, rig, tmp_path / "1", frames=window)
     assert len(rows(alone)) == window.n_frames(2 * N_PICTURES)
-    for n in (2, 4):
+    for n in part_of([2, 4]):
         shared = measured(dive, rig, tmp_path / str(n), frames=window, n_processes=n)
         assert same(alone, shared) == list(RESULTS)
     assert not multiprocessing.active_children()

@@ -13,11 +13,13 @@ from aqualvs.check import doctor
 from aqualvs.check import doctor as doctor_autopilot
 from aqualvs.check.doctor import _EXTRAS, DoctorRequest, run_doctor
 from aqualvs.errors import AqualvsError
+from aqualvs.text import Finding
 from field_cases import interlaced_rig, woven_dive
 from ports import free_port
 from repository import ROOT
 from shell_cases import cut_after, write_video
 
+MEASURE = doctor._speed
 DEMO = Path(doctor.__file__).parents[1] / "data" / "demo"
 
 
@@ -29,7 +31,14 @@ def told(request: DoctorRequest, fault: str | None = None) -> str:
     return text.getvalue()
 
 
-def test_this_machine_decodes_and_measures() -> None:
+@pytest.fixture(autouse=True)
+def no_dive_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measuring the bundled dive would be most of the time of each test."""
+    monkeypatch.setattr(doctor, "_speed", lambda *_: Finding.ok("not measured"))
+
+
+def test_this_machine_decodes_and_measures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_speed", MEASURE)
     text = told(DoctorRequest())
     assert "H.264 decoded: 40 frames" in text
     assert "posture in 39 of 40 frames" in text or "posture in 40 of 40 frames" in text

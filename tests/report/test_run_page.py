@@ -32,6 +32,7 @@ from aqualvs.scanning.scan import Label
 from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, REASON_WORDS, reason_text
 from report_cases import COLUMNS, FPS, LASERS, NASTY, NASTY_LASER, Dive, make_dive, write_truth
 from shell_cases import grey, write_video
+from whole import WHOLE
 
 
 def data_of(page: str) -> dict[str, Any]:
@@ -512,7 +513,7 @@ def test_every_reason_and_label_has_words() -> None:
     ),
     st.integers(4, 60),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150 if WHOLE else 50, deadline=None)
 def test_thinning_is_bounded_and_keeps_extremes(values: NDArray[np.float64], limit: int) -> None:
     rows = thin(values, limit)
     finite = np.flatnonzero(np.isfinite(values))
