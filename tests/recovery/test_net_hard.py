@@ -74,7 +74,8 @@ class Shot(NamedTuple):
 
 @cache
 def equipment() -> tuple[QuickRenderer, Scanner]:
-    return QuickRenderer(example_rig(), halo_px=31), Scanner(example_rig())
+    # Light more than 7 px beside a sheet's is little, and takes two thirds of the time of folds.
+    return QuickRenderer(example_rig(), halo_px=31 if WHOLE else 15), Scanner(example_rig())
 
 
 def shoot(
@@ -193,7 +194,8 @@ def test_a_flank_with_most_of_the_strands_is_no_sure_posture(seed: int) -> None:
             (0.6, 0.035, 0.05, 0.03, 0.3),
             (2.0, 0.045, 0.07, 0.03, 0.3),
             (0.3, 0.05, 0.08, 0.035, 0.3),
-        ]
+        ],
+        every=3,
     ),
 )
 def test_a_wall_is_no_target_where_a_net_before_it_makes_no_plane(

@@ -24,7 +24,7 @@ from aqualvs.simulation.truth import target_fit, visible_fit
 from net_dives import frame_of
 from quick_pictures import QuickRenderer
 from scanning_cases import merged
-from whole import part_of
+from whole import WHOLE, part_of
 
 SMALL, WIDE, FLAT = "example", "bluerov2", "flat port"
 RIGS = {SMALL: example_rig, WIDE: bluerov2_rig, FLAT: flat_port_rig}
@@ -57,6 +57,12 @@ def whole() -> Renderer:
 
 
 @cache
+def of_nets() -> Renderer | QuickRenderer:
+    """Renderer of nets without clutter: every ray, or all of the light on twine and beside it."""
+    return whole() if WHOLE else QuickRenderer(example_rig(), halo_px=31)
+
+
+@cache
 def quick(rig_name: str) -> QuickRenderer:
     return QuickRenderer(RIGS[rig_name]())
 
@@ -67,7 +73,8 @@ def shoot(scenario_name: str, t: float, rig_name: str = SMALL) -> Shot:
     scene = scenario.scene_at(t)
     # On walls nothing but light is there, and large pictures are for what the lens does to it.
     light_alone = rig_name != SMALL or scene.target == "wall"
-    eye = quick(rig_name) if light_alone else whole()
+    with_clutter = bool(scene.fish or scene.bubbles)
+    eye = quick(rig_name) if light_alone else whole() if with_clutter else of_nets()
     picture = eye.render(scene, t, np.random.default_rng([7, round(1000 * t)]))
     posture = scanner_of(rig_name).process(frame_of(0, t, picture.image)).posture
     if scene.target == "none":
@@ -208,7 +215,7 @@ def test_a_bulging_net_is_touched_where_it_is_nearest() -> None:
         )
         pose = dome_from_target(rng.uniform(0.35, 0.7), *np.deg2rad(rng.uniform(-8.0, 8.0, 2)))
         scene = Scene(dome_from_scene=pose, nets=(net,), target="net")
-        picture = whole().render(scene, 0.0, np.random.default_rng(i))
+        picture = of_nets().render(scene, 0.0, np.random.default_rng(i))
         posture = scanner_of(SMALL).process(frame_of(0, 0.0, picture.image)).posture
         truth = target_fit(scene, picture.lit)
         assert posture
@@ -219,14 +226,24 @@ def test_a_bulging_net_is_touched_where_it_is_nearest() -> None:
         is_curved.append(posture.curvature is not None)
     assert sum(is_curved) >= 7
     spread = np.sqrt(np.mean(np.square(normalised)[is_curved], axis=0))
-    assert np.all(spread > 0.35), spread
+    # Of seven values at a true 1: below 0.3 once in 500, above 1.8 once in 500.
+    assert np.all(spread > 0.3), spread
     assert np.all(spread < 1.8), spread
     # Of 42 such nets seen as planes, with few strands or weak bends, 2 are beyond it.
     assert np.abs(normalised).max() < 4.0
 
 
-@pytest.mark.parametrize("rig_name", [WIDE, FLAT])
-@pytest.mark.parametrize(("name", "t"), [("wall_yaw", 1.5), ("net_diamond", 1.0)])
+@pytest.mark.parametrize(
+    ("name", "t", "rig_name"),
+    part_of(
+        [
+            ("wall_yaw", 1.5, WIDE),
+            ("wall_yaw", 1.5, FLAT),
+            ("net_diamond", 1.0, FLAT),
+            ("net_diamond", 1.0, WIDE),
+        ]
+    ),
+)
 def test_a_wide_picture(name: str, t: float, rig_name: str) -> None:
     share, pitch, yaw = errors(shoot(name, t, rig_name))
     assert abs(share) < (0.001 if name == "wall_yaw" else 0.01)
@@ -236,7 +253,7 @@ def test_a_wide_picture(name: str, t: float, rig_name: str) -> None:
 def test_a_net_whose_stripes_lost_their_colour() -> None:
     # As H.264 at low bit rates, which drops the chroma of dashes a few pixels long.
     scene = load_scenario("net_diamond").scene_at(2.0)
-    picture = whole().render(scene, 2.0, np.random.default_rng(7))
+    picture = of_nets().render(scene, 2.0, np.random.default_rng(7))
     frame, scanner = frame_of(0, 2.0, picture.image), scanner_of(SMALL)
     assert frame.chroma is not None
     neutral = tuple(np.full_like(plane, 128) for plane in frame.chroma)
@@ -293,8 +310,10 @@ def test_the_wall_behind_a_net_is_never_the_target() -> None:
         assert abs(shot.posture.range - shot.truth.offset) < 0.05 * shot.truth.offset
 
 
-@pytest.mark.parametrize("name", ["lasers_off", "empty"])
-@pytest.mark.parametrize("t", [0.0, 0.5])
+@pytest.mark.parametrize(
+    ("name", "t"),
+    part_of([("lasers_off", 0.0), ("lasers_off", 0.5), ("empty", 0.5), ("empty", 0.0)]),
+)
 def test_no_stripes_give_no_posture_but_a_reason(name: str, t: float) -> None:
     posture = shoot(name, t).posture
     assert not posture
