@@ -33,7 +33,7 @@ from rig_from_sample_truth import load_truth
 from whole import WHOLE
 
 DIFFICULTIES: tuple[Difficulty, ...] = ("clean", "usual", "hard")
-N_SCENES = 24 if WHOLE else 9
+N_SCENES = 24 if WHOLE else 6
 
 
 class Judged(NamedTuple):

@@ -112,7 +112,7 @@ def test_compression_moves_a_posture_little(measured, picture: str, fmt: str) ->
     assert abs(ours.pitch_error_deg - plain.pitch_error_deg) < 0.1
 
 
-@pytest.mark.parametrize("picture", PICTURES)
+@pytest.mark.parametrize("picture", part_of(PICTURES))
 def test_a_camera_may_sharpen_until_the_wall_between_lines_stands_out(tmp_path, picture) -> None:
     """Sharpening darkens the flanks of lines; thousands of wide specks of wall lie between them."""
     image = photograph(picture)
@@ -129,7 +129,9 @@ def test_a_monochrome_camera_measures_as_well(tmp_path, fmt: str) -> None:
     assert_on_board(measured_as(fmt, without_colour(photograph(picture)), picture, tmp_path))
 
 
-@pytest.mark.parametrize(("light", "noise"), part_of([(0.35, 5.0), (0.5, 4.0), (0.3, 4.0)]))
+@pytest.mark.parametrize(
+    ("light", "noise"), part_of([(0.35, 5.0), (0.5, 4.0), (0.3, 4.0)], every=3)
+)
 @pytest.mark.parametrize("picture", part_of(PICTURES))
 def test_lines_that_noise_nearly_hides_are_measured(
     tmp_path, picture: str, light: float, noise: float
@@ -228,7 +230,9 @@ def found_board(image: np.ndarray, picture: str) -> View:
     return found
 
 
-@pytest.mark.parametrize(("scale", "light"), part_of([(20, 0.8), (20, 1.0), (28, 1.0), (24, 1.0)]))
+@pytest.mark.parametrize(
+    ("scale", "light"), part_of([(28, 1.0), (20, 1.0), (20, 0.8), (24, 1.0)], every=4)
+)
 def test_lines_whose_chroma_is_quantised_away_are_no_net(tmp_path, scale: int, light: float):
     """Motion JPEG as encoders write it by default keeps the colour of a tenth of these lines."""
     dimmed = np.asarray(light * photograph("image5"), np.uint8)
@@ -294,6 +298,12 @@ BLURRED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+@cache
+def n_stripes_of(picture: str) -> int:
+    """Number of stripe points in a photograph that is sharp, in a picture of its camera's size."""
+    return len(find_stripes(in_whole_picture(photograph(picture))))
+
+
 @pytest.mark.parametrize("blurred", BLURRED.values(), ids=BLURRED.keys())
 @pytest.mark.parametrize("picture", part_of(PICTURES))
 def test_blurred_lines_are_found(tmp_path, picture: str, blurred) -> None:
@@ -301,7 +311,7 @@ def test_blurred_lines_are_found(tmp_path, picture: str, blurred) -> None:
     image = photograph(picture)
     assert_on_board(measured_as("crf23", blurred(image), picture, tmp_path))
     whole = in_whole_picture(image)
-    assert len(find_stripes(blurred(whole))) > 0.9 * len(find_stripes(whole))
+    assert len(find_stripes(blurred(whole))) > 0.9 * n_stripes_of(picture)
     red = UncalibratedStripeOptions(wavelength_nm=650.0)
     assert len(find_stripes(blurred(whole), red)) == 0
 

@@ -125,7 +125,7 @@ def test_red_lasers_through_the_commands(
     save_rig(rig, tmp_path / "green.yaml")
     motion = {"range_mm": [350, 550], "yaw_deg": [-8, 6], "slide_x_mm": [0, 90]}
     target = {"net": {"twine_mm": 2.2}} if dive.startswith("net") else {"walls": [{}]}
-    content = {"duration_s": 1.0, "fps": 4.0, "motion": motion, **target}
+    content = {"duration_s": 1.0, "fps": 3.0, "motion": motion, **target}
     scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
     made = tmp_path / "dive"
     rendering = ["--camera", camera, "--rig", str(tmp_path / "rig.yaml"), "-o", str(made)]
@@ -138,7 +138,7 @@ def test_red_lasers_through_the_commands(
         return _rows(out / "posture.csv")
 
     found, truth = postures("rig.yaml"), _rows(made / "truth.csv")
-    assert len(found) == len(truth) == 4
+    assert len(found) == len(truth) == 3
     for row, true in zip(found, truth, strict=True):
         assert row["valid"] == "1", row["reason"]
         expected = float(true[_TRUTH[0]]) * 1e-3
