@@ -79,7 +79,8 @@ BOXES = ["box", "box_water"] if WHOLE else ["box_water"]
 def laser_rig(request: pytest.FixtureRequest, folder: Path, dome_rig: Path) -> Path:
     source = folder / request.param
     path = dome_rig.parent / f"{request.param}.yaml"
-    _run("lasers", source, "--box", source / "box.yaml", "--rig", dome_rig, "-o", path)
+    pictures = [source] if WHOLE else sorted(source.glob("*.png"))[:4]
+    _run("lasers", *pictures, "--box", source / "box.yaml", "--rig", dome_rig, "-o", path)
     return path
 
 

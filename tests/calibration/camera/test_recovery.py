@@ -110,9 +110,10 @@ def test_halves_of_the_views_differ_by_their_sigmas(
 def test_few_views_promise_no_more_than_they_hold() -> None:
     """Six views; none of the sigmas may be small by chance."""
     errors = []
-    for seed in range(N_SEEDS):
+    for seed in range(N_SEEDS if WHOLE else 3):
+        moved = _moved(seed)
         for part in range(4):
-            views = _moved(seed)[part : part + 21 : 4]
+            views = moved[part : part + 21 : 4]
             bundle, solution = fitted_camera(views, SIZE, LensModel.OPENCV, 4)
             sigma = np.sqrt(np.diag(shared_covariance(bundle, solution).by_views))[:4]
             lens = solution.state.rig.lens
@@ -132,20 +133,20 @@ def test_a_bent_board_is_recognised_and_solved_for(bend: tuple[float, ...]) -> N
     plane = np.column_stack([bent[:, :2], np.ones(len(bent))])
     height = np.ptp(bent[:, 2] - plane @ np.linalg.lstsq(plane, bent[:, 2], rcond=None)[0])
     errors = []
-    for seed in range(4):
+    for seed in range(4 if WHOLE else 3):
         found = camera(_views(seed, lambda: np.array(bend), n=16), SIZE)
         assert found.bend_height == pytest.approx(height, rel=0.05, abs=2e-5)
         assert found.noise_px == pytest.approx(0.1, rel=0.06)
         assert "the board is not flat" in "\n".join(found.findings)
         sigmas = found.uncertainty.sigmas
         errors.append([(getattr(found.lens, n) - getattr(LENS, n)) / sigmas[n] for n in NAMES])
-    # 16 errors, of pairs that go together: 1 ± 0.3.
+    # 12 errors or more, of pairs that go together: 1 ± 0.3.
     assert 0.4 < _rms(errors) < 1.6
 
 
 def test_a_flat_board_is_left_flat() -> None:
     """Also where views share errors, which a bend that is common to all could seem to explain."""
-    for seed in range(5 if WHOLE else 2):
+    for seed in range(5 if WHOLE else 1):
         for shoot in (_clean, _moved):
             found = camera(shoot(seed), SIZE)
             assert found.bend_height == 0.0

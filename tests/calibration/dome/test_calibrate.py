@@ -44,8 +44,10 @@ def _solve(
     return dome(guessed(rig, rotation_known=rotation_known), sets, options, known)
 
 
-def _rail(kind: str = "distance", rig: Rig = PAPER, n: float = AIR, seed: int = 1) -> Shoot:
-    return rail(rig, n, kind, np.random.default_rng(seed))
+def _rail(
+    kind: str = "distance", rig: Rig = PAPER, n: float = AIR, seed: int = 1, n_views: int = 8
+) -> Shoot:
+    return rail(rig, n, kind, np.random.default_rng(seed), n_views=n_views)
 
 
 # What is given of the boards, and how far the lens may be off, mm.
@@ -345,7 +347,7 @@ def test_refuses_lengths_that_do_not_fit(spoil: Callable[[Shoot], Shoot], messag
 
 
 def _poses(change: Callable[[SE3], SE3]) -> Shoot:
-    shoot = _rail("exact")
+    shoot = _rail("exact", n_views=5)
     return shoot.with_given([Given(dome_from_board=change(pose)) for pose in shoot.poses])
 
 
@@ -377,7 +379,7 @@ def test_refuses_poses_that_do_not_fit(change: Callable[[SE3], SE3], message: st
     ],
 )
 def test_refuses_the_wrong_medium(kind: str, taken: float) -> None:
-    shoot = _rail(kind, n=taken)
+    shoot = _rail(kind, n=taken, n_views=6)
     stated, sigma = (WATER, 5e-4) if taken == AIR else (AIR, 0.0)
     word = "air" if taken == AIR else "water"
     with pytest.raises(CalibrationError, match=f"were they taken in {word}"):
@@ -424,7 +426,7 @@ def test_refuses_a_rig_without_a_dome() -> None:
 
 
 def test_refuses_another_board() -> None:
-    shoot, rng = _rail("unknown"), np.random.default_rng(6)
+    shoot, rng = _rail("unknown", n_views=4), np.random.default_rng(6)
     views = tuple(View(v.name, v.ids, rng.permutation(v.points), v.pixels) for v in shoot.views)
     with pytest.raises(CalibrationError, match="no pose of the board explains the pictures"):
         _solve([BoardSet(name="air", views=views)], rotation_known=True)

@@ -79,7 +79,8 @@ def test_a_tilt_that_all_boards_share_is_in_sigma_if_it_is_stated() -> None:
         true = drawn_rig(example_rig(), QUICK, rng)
         tilt = float(np.deg2rad(0.05))
         shoot = rail(true, AIR, "distance", rng, n_views=6, tilt=tilt, shared_tilt=shared_tilt)
-        for options in (QUICK, stated):
+        # Unstated it is off by several sigmas, which four runs tell as well.
+        for options in (QUICK, stated) if seed < 4 else (stated,):
             start = guessed(example_rig(), rotation_known=False)
             found = dome(start, [shoot.as_set(AIR, 0.0, "air")], options, INTRINSICS)
             errors = normalised_errors(found, true, shoot.poses)
@@ -201,8 +202,8 @@ def test_dome_of_the_sample(
     lens_mm: float,
     rotation_deg: float,
 ) -> None:
-    # Exact poses tell more than enough in ten pictures.
-    views = _views(paper / name, 10 if kind == "exact" and not WHOLE else None)
+    # Ten pictures tell enough.
+    views = _views(paper / name, None if WHOLE else 10)
     with (paper / name / "poses.csv").open(encoding="utf-8") as file:
         rows = {row["file"]: row for row in csv.DictReader(file)}
     given = [_given(rows[view.name], kind) for view in views]
