@@ -111,7 +111,8 @@ def test_the_jacobian_is_that_of_the_whole_scanner(rig: Rig) -> None:
 def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str, n_draws: int) -> None:
     """Rigs drawn from the covariance measure what the true rig has seen."""
     uncertainty, rng = calibrated(rig), np.random.default_rng(1)
-    times = (0.5, 1.5, 2.5)
+    # The large pictures of the wide rig take most of the time.
+    times = (1.0, 2.5) if rig.name == "bluerov2" and not WHOLE else (0.5, 1.5, 2.5)
     views = [seen(rig.name, scenario, t) for t in times]
     sigma = np.array([*uncertainty.sigmas.values()])
     # Draws whose own second moments are exactly those of the covariance: fewer do.
