@@ -71,6 +71,7 @@ def test_a_design_in_metres_is_refused(refused):
         ("--salinity", "350", "give per mille, from 0 to 40"),
         ("--temperature-c", "288", "give degrees Celsius, from 0 to 30; 14.85 if kelvin are meant"),
         ("--temperature-c", "59", "give degrees Celsius, from 0 to 30; 15 if degrees Fahrenheit"),
+        ("--temperature-c", "33", "give degrees Celsius, from 0 to 30; for warmer water give its"),
         ("--temperature-c", "-3", "give degrees Celsius, from 0 to 30"),
     ],
 )

@@ -133,14 +133,16 @@ def water_fault(temperature_c: float | None, salinity_permille: float | None) ->
 
     None was not given. Returns "temperature_c" or "salinity" and the remedy, or two empty texts.
     """
-    warmest_c, kelvin_from, saltiest, least_salt = 30.0, 200.0, 40.0, 0.1
+    warmest_c, fahrenheit_from, kelvin_from, saltiest, least_salt = 30.0, 40.0, 200.0, 40.0, 0.1
     if temperature_c is not None and not 0.0 <= temperature_c <= warmest_c:
         celsius, unit = temperature_c - 273.15, "kelvin"
         if temperature_c < kelvin_from:
             celsius, unit = (temperature_c - 32.0) / 1.8, "degrees Fahrenheit"
         hint = ""
-        if temperature_c > warmest_c and 0.0 <= celsius <= warmest_c:
+        if temperature_c >= fahrenheit_from and 0.0 <= celsius <= warmest_c:
             hint = f"; {celsius:.4g} if {unit} are meant"
+        elif warmest_c < temperature_c < fahrenheit_from:
+            hint = "; for warmer water give its refractive index instead"
         return "temperature_c", f"give degrees Celsius, from 0 to {warmest_c:g}{hint}"
     if salinity_permille is None or salinity_permille == 0.0:
         return "", ""
