@@ -3,11 +3,13 @@
 from dataclasses import replace
 from functools import cached_property, partial, partialmethod
 from itertools import chain
+from pathlib import Path
 
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from aqualvs import experiments
 from aqualvs.experiments import ablation_stages, growth_and_sun, mesh_filter, page, sea, water_index
 from aqualvs.experiments import laboratory as tank
 from aqualvs.experiments.experiment import MODULES, experiment
@@ -31,7 +33,7 @@ N_FRAMES = 4
 JUDGED = (2, 8)
 # Bars for full pictures and whole dives; all others are reached by these, too.
 FOR_FULL_PICTURES = {
-    "changes of the medium noticed as such, the dive into the water among them",
+    "changes of the medium detected, including the entry into the water",
     "pitch and yaw error that remains, largest (°)",
     "largest error of the range to the net (%)",
     "largest error of a single point with the dome model (%)",
@@ -119,6 +121,12 @@ def test_an_experiment_gives_its_results(
     for one in record.pictures:
         # Something is drawn: more than axes without a curve.
         assert (tmp_path / "figures" / f"{one.file}.png").stat().st_size > 5_000
+
+
+def test_bars_for_full_pictures_are_bars_of_experiments():
+    """An ordinary run may meet none of them; by another name, each would fail in full only."""
+    texts = [path.read_text("utf-8") for path in Path(experiments.__file__).parent.glob("*.py")]
+    assert [bar for bar in FOR_FULL_PICTURES if not any(bar in text for text in texts)] == []
 
 
 def test_the_filters_sentence_states_the_worst_net_and_range(monkeypatch):
