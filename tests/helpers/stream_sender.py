@@ -1,4 +1,4 @@
-"""Sends a clip of H.264 as vehicles do; a program of its own, so that the tests hear a real stream.
+"""Sends a clip of H.264 as vehicles do, from the process of a test or as a program of its own.
 
 RTP and MPEG-TS are made by FFmpeg's muxers, and pass through a relay that loses, damages or
 renumbers datagrams by a fixed seed. The same datagrams go out at any speed of the machine.
@@ -301,6 +301,22 @@ def parse_options(arguments=None):
         "--hold", type=int, nargs="*", default=[], help="before these frames, for a line of input"
     )
     return parser.parse_args(arguments)
+
+
+def words_of(clips, port, options):
+    """Return the words of a command line; an option that is True is a switch."""
+    words = [*map(str, clips), "--port", str(port)]
+    for name, value in options.items():
+        words.append("--" + name.replace("_", "-"))
+        words += [] if value is True else [str(value)]
+    return words
+
+
+def send_here(*clips, port, **options):
+    """Send clips from this process and return what the program would print."""
+    asked = parse_options(words_of(clips, port, options))
+    with to_port(port) as send:
+        return send_clips(asked, send)
 
 
 def main():

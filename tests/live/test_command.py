@@ -31,7 +31,7 @@ from complaints import complaints
 from live_cases import demo_frames, demo_rig, first_sample
 from ports import free_port
 from shell_cases import all_key_frames, cut_after
-from stream_sender import make_clip, parse_options, send_clips, to_port
+from stream_sender import make_clip, send_here
 from waiting import TIMEOUT_S, until
 
 N_CLIP = 36
@@ -96,11 +96,7 @@ class Live:
             raise AssertionError(f"{fault}; it said {self.told[-12:]}") from None
 
     def send(self, *clips: Path, **options: object) -> None:
-        words = [*map(str, clips), "--port", str(self.port)]
-        for name, value in options.items():
-            words += ["--" + name.replace("_", "-"), str(value)]
-        with to_port(self.port) as send:
-            send_clips(parse_options(words), send)
+        send_here(*clips, port=self.port, **options)
 
     def send_until(
         self, clip: Path, condition: Callable[[], object], what: str, **options: object

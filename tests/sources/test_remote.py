@@ -21,6 +21,7 @@ from aqualvs.sources import datagrams, live_frames, open_feed, remote
 from aqualvs.sources.base import State
 from aqualvs.sources.remote import RemoteFeed
 from ports import free_port
+from stream_sender import send_here as send
 from waiting import TIMEOUT_S, until
 
 SD, HD = (720, 576), (1920, 1080)
@@ -130,17 +131,9 @@ def udp_listener():
         yield listener
 
 
-def words_of(clips, port, options):
-    words = [*map(str, clips), "--port", str(port)]
-    for name, value in options.items():
-        words.append("--" + name.replace("_", "-"))
-        words += [] if value is True else [str(value)]
-    return words
-
-
 def sender(*clips, port, **options):
     """Start the sender in a process of its own, which waits where it is told to."""
-    command = [sys.executable, str(SENDER), *words_of(clips, port, options)]
+    command = [sys.executable, str(SENDER), *stream_sender.words_of(clips, port, options)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
@@ -150,13 +143,6 @@ def go_on(process):
     process.stdin.write("\n")
     process.stdin.flush()
     return at
-
-
-def send(*clips, port, **options):
-    """Send clips from this process and return what the sender tells."""
-    asked = stream_sender.parse_options(words_of(clips, port, options))
-    with stream_sender.to_port(port) as outlet:
-        return stream_sender.send_clips(asked, outlet)
 
 
 @pytest.mark.parametrize(("name", "size", "n"), [("sd", SD, 50), ("hd", HD, 30)])
