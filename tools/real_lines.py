@@ -22,7 +22,7 @@ import dataclasses
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -250,19 +250,28 @@ class Shot:
     scores: list[Score]
 
 
+def pictures_of(samples: Path) -> dict[str, Path]:
+    """Return every picture by its name, the folder's and its own."""
+    paths = [path for path in sorted(samples.glob("*/*")) if path.suffix in (".png", ".jpg")]
+    return {f"{path.parent.name}/{path.name}": path for path in paths}
+
+
+def shows_laser(name: str, traced: Container[str]) -> bool:
+    """Return whether a picture shows a laser: its lines are traced, or it is the lit of a pair."""
+    return name in traced or "-b-" in name
+
+
 def shots(
     samples: Path, formats: Sequence[str], wanted: Callable[[str], bool] = lambda _: True
 ) -> Iterator[Shot]:
     """Read, search and score every picture of which the name is wanted, in every format."""
     traced = traced_lines()
-    pictures = [p for p in sorted(samples.glob("*/*")) if p.suffix in (".png", ".jpg")]
-    for path in pictures:
-        name = f"{path.parent.name}/{path.name}"
+    for name, path in pictures_of(samples).items():
         if not wanted(name):
             continue
         image = read_image(path)
         red = path.parent.name.startswith("red")
-        is_on = name in traced or "-b-" in path.name
+        is_on = shows_laser(name, traced)
         line = None
         if "-b-" in path.name:
             off = read_image(Path(str(path).replace("-b-", "-a-")))

@@ -18,19 +18,13 @@ FORMATS = SHARP + BLURRED
 MIN_PAIRS = {"png": 9, "jpg80": 9, "crf23": 8, "soft-crf23": 5}
 
 
-def without_laser(folder: Path) -> list[str]:
-    """Names of the pictures that show no laser, as `real_lines.shots` names them."""
-    pictures = [path for path in sorted(folder.glob("*/*")) if path.suffix in (".png", ".jpg")]
-    names = [f"{path.parent.name}/{path.name}" for path in pictures]
-    lit = real_lines.traced_lines()
-    return [name for name in names if name not in lit and "-b-" not in name]
-
-
 @pytest.fixture(scope="module")
 def line_scores(samples: Path) -> dict[str, list[real_lines.Score]]:
     scores: dict[str, list[real_lines.Score]] = {fmt: [] for fmt in FORMATS}
     folder = samples / "real-laser-lines"
-    left_out = set() if WHOLE else set(without_laser(folder)[1::2])
+    traced, names = real_lines.traced_lines(), real_lines.pictures_of(folder)
+    dark = [name for name in names if not real_lines.shows_laser(name, traced)]
+    left_out = [] if WHOLE else dark[1::2]
     for shot in real_lines.shots(folder, FORMATS, lambda name: name not in left_out):
         for score in shot.scores:
             scores[score.format].append(score)
