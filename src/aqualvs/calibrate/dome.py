@@ -93,8 +93,8 @@ def _check_length(option: str, length_mm: float | None, least: float, most: floa
     """Raise `OptionError` for a length that no housing has; it names the unit that may be meant."""
     if length_mm is None or least <= length_mm <= most:
         return
-    in_metres = 1e3 * length_mm
-    hint = f"; {in_metres:g} if metres are meant" if least <= in_metres <= most else ""
+    if_metres = 1e3 * length_mm
+    hint = f"; {if_metres:g} if metres are meant" if least <= if_metres <= most else ""
     raise OptionError(f"{option} {length_mm:g}: give millimetres, from {least:g} to {most:g}{hint}")
 
 

@@ -20,7 +20,7 @@ GREEN_NM = 532.0
 
 
 class _QuanFry(NamedTuple):
-    """Coefficients of the formula of Quan and Fry (1995)."""
+    """Coefficients of the formula of Quan and Fry (1995), and the water for which it holds."""
 
     n0: float = 1.31405
     n1: float = 1.779e-4
@@ -32,6 +32,8 @@ class _QuanFry(NamedTuple):
     n7: float = -0.00423
     n8: float = -4382.0
     n9: float = 1.1455e6
+    warmest_c: float = 30.0
+    saltiest: float = 40.0  # Per mille.
 
 
 _FORMULA = _QuanFry()
@@ -109,8 +111,8 @@ def seawater_index_slopes(
 
 def _checked(*values: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     ranges = (
-        ("water temperature", "°C", 0.0, 30.0),
-        ("salinity", "per mille", 0.0, 40.0),
+        ("water temperature", "°C", 0.0, _FORMULA.warmest_c),
+        ("salinity", "per mille", 0.0, _FORMULA.saltiest),
         ("wavelength", "nm", 400.0, 700.0),
     )
     arrays = []
@@ -133,7 +135,8 @@ def water_fault(temperature_c: float | None, salinity_permille: float | None) ->
 
     None was not given. Returns "temperature_c" or "salinity" and the remedy, or two empty texts.
     """
-    warmest_c, fahrenheit_from, kelvin_from, saltiest, least_salt = 30.0, 40.0, 200.0, 40.0, 0.1
+    warmest_c, saltiest, least_salt = _FORMULA.warmest_c, _FORMULA.saltiest, 0.1
+    fahrenheit_from, kelvin_from = 40.0, 200.0
     if temperature_c is not None and not 0.0 <= temperature_c <= warmest_c:
         celsius, unit = temperature_c - 273.15, "kelvin"
         if temperature_c < kelvin_from:
