@@ -89,7 +89,7 @@ def same_bits(left, right):
 def test_rosbags_understands_every_message(tmp_path, samples):
     path = recorded(tmp_path / "dive.mcap", samples)
     found = decoded(path)
-    assert [len(found[t.name]) for t in (POSTURE, STRIPES, POINTS, HEALTH, RIG)] == [8, 8, 8, 1, 1]
+    assert [len(found[t.name]) for t in (POSTURE, STRIPES, POINTS, HEALTH, RIG)] == [8, 8, 8, 1, 2]
     for sample, message in zip(samples, found[POSTURE.name], strict=True):
         posture = sample.scan.posture
         assert (message.frame, message.time_s, message.valid) == (
@@ -499,7 +499,19 @@ def test_a_file_without_its_end_is_read_as_far_as_it_goes(tmp_path, samples):
     path.write_bytes(whole[: chunks[-1] + 1000])
     assert is_recording(path)
     n = len(list(DiveRecording(path).frames(with_pictures=False)))
-    assert n == 2 * (len(chunks) - 1)
+    assert n == 1 + 2 * (len(chunks) - 2)
+
+
+def test_the_first_sample_is_in_the_file_at_once_and_the_rig_with_it(tmp_path, samples):
+    """A disk that is full, or a kill, in the first half second leaves what can be replayed."""
+    path = tmp_path / "dive.mcap"
+    recording = Recording(path, RecorderOptions())
+    for sample in samples[:2]:
+        recording.write(sample)
+    dive = DiveRecording(path)
+    assert len(list(dive.frames(with_pictures=False))) == 1
+    assert dive.rig is not None
+    recording.close()
 
 
 @pytest.mark.parametrize("length", [1 << 62, (1 << 64) - 1])

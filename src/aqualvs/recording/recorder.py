@@ -43,14 +43,18 @@ class SampleChunks:
         self.n_samples = 0  # In the present chunk.
 
     def add(self, sample: LiveSample) -> bool:
-        """Add a sample; return whether the chunk is due."""
+        """Add a sample; return whether the chunk is due.
+
+        The first one is due with the first sample: the rig is in the file from then on, and fits
+        where a disk is nearly full.
+        """
         stamp_ns = self._clock.stamp_ns(sample)
         self._from_ns = self._from_ns or stamp_ns
         self._publish_ns = max(sample.utc_ns, 0)
         self._add(self._encoder.messages(sample, stamp_ns), stamp_ns)
         self._sequence += 1
         self.n_samples += 1
-        long = stamp_ns - self._from_ns >= self._chunk_ns
+        long = self._sequence == 1 or stamp_ns - self._from_ns >= self._chunk_ns
         return long or self._builder.n_bytes >= MAX_CHUNK_BYTES
 
     def finish(self) -> None:
