@@ -201,6 +201,20 @@ def test_a_wall_in_a_wide_picture(target: Plane) -> None:
     assert_posture(found.posture, target)
 
 
+@pytest.mark.parametrize("yaw_deg", [0.0, 8.0])
+def test_a_wall_under_lasers_a_third_of_a_turn_apart(yaw_deg: float) -> None:
+    """Each stripe also crosses the other lasers' search lines, which see it as a steep line."""
+    rig = bluerov2_rig()
+    planes = [
+        Plane(np.array([np.cos(turn), -0.27, np.sin(turn)]) / np.hypot(1.0, 0.27), -0.13)
+        for turn in np.deg2rad([60.0, -30.0, 210.0])
+    ]
+    lasers = [replace(one, plane=sheet) for one, sheet in zip(rig.lasers, planes, strict=True)]
+    target = plane(0.6, 0.0, yaw_deg)
+    found = scan([(target, everywhere)], rig=replace(rig, lasers=tuple(lasers)))
+    assert_posture(found.posture, target)
+
+
 @pytest.mark.parametrize("target", [plane(0.4), plane(0.55, -6.0, 11.0)], ids=str)
 def test_a_net_in_open_water(target: Plane) -> None:
     found = scan([(target, strands)])

@@ -14,12 +14,14 @@ N_LINES, LENGTH = 400, 300
 
 
 def search_for(
-    slopes: tuple[float, float] = (-1.0, 1.0), band: tuple[int, int] = (0, LENGTH - 1)
+    slopes: tuple[float, float] = (-1.0, 1.0),
+    band: tuple[int, int] = (0, LENGTH - 1),
+    line_px: int = 1,
 ) -> LaserBand:
     cells = np.ones((-(-LENGTH // 8), -(-N_LINES // 8)))
     return LaserBand(
         axis=SearchAxis.ALONG_Y,
-        line_px=1,
+        line_px=line_px,
         lowest=np.full(N_LINES, band[0]),
         highest=np.full(N_LINES, band[1]),
         slope_low=slopes[0] * cells,
@@ -132,6 +134,19 @@ def test_a_long_segment_in_a_wrong_direction_is_dropped_and_a_dash_is_kept() -> 
     np.testing.assert_allclose(np.sort(kept[kept > 60.0]), dash[1])
     # Where a laser may run so, the same stripe stays.
     assert len(link_segments(peaks, search_for()).order) == peaks.n
+
+
+@pytest.mark.parametrize("line_px", [1, 2])
+@pytest.mark.parametrize("slope", [1.3, 1.8])
+def test_a_steep_line_of_another_laser_is_dropped_on_wide_search_lines_too(
+    slope: float, line_px: int
+) -> None:
+    peaks = peaks_at(straight(10, 79, 5.0, slope * line_px))
+    assert not len(link_segments(peaks, search_for((-line_px, line_px), line_px=line_px)).order)
+    as_steep = search_for((-2.0 * line_px, 2.0 * line_px), line_px=line_px)
+    found = link_segments(peaks, as_steep)
+    assert len(found.order) == peaks.n
+    assert len(np.unique(found.subsegment)) == -(-peaks.n // SUBSEGMENT_LINES)
 
 
 def test_a_dash_is_one_chunk() -> None:

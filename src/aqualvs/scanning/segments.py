@@ -266,6 +266,9 @@ SUBSEGMENT_LINES = 16
 
 # A gap of one search line does not end a segment: H.264 and specks make such gaps.
 _MAX_LINE_STEP = 2
+# Largest distance of a peak from the predicted position. The second peak of a segment, whose slope
+# is not known yet, may be as far away for each pixel of a search line: search lines of two pixels
+# see twice the slope.
 _LINK_GATE_PX = 2.0
 
 
@@ -319,7 +322,7 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     # No band: limits beyond any position on a search line.
     anywhere = 1 << 40
     lowest, highest = np.full(n_lines, -anywhere), np.full(n_lines, anywhere)
-    _link(line, position, lowest, highest, segment_of, first, last, count)
+    _link(line, position, lowest, highest, 1, segment_of, first, last, count)
     long = np.empty(n, np.bool_)
     for i in range(n):
         long[i] = count[segment_of[i]] >= SUBSEGMENT_LINES
@@ -336,7 +339,9 @@ def segment_peaks(peaks: StripePeaks, band: BandLines, numbers: IntArray) -> int
     segment_of = np.empty(n, np.int64)
     # First and last peak of each segment, and the number of its peaks.
     first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    n_segments = _link(line, position, band.lowest, band.highest, segment_of, first, last, count)
+    n_segments = _link(
+        line, position, band.lowest, band.highest, band.line_px, segment_of, first, last, count
+    )
     start = _sort_by_segment(segment_of, count[:n_segments], numbers)
     n_kept = _drop_foreign(peaks, band, start, first, last, numbers)
     root = _join_components(line, position, first[:n_kept], last[:n_kept])
@@ -375,6 +380,7 @@ def _link(
     position: FloatArray,
     lowest: IntArray,
     highest: IntArray,
+    line_px: int,
     segment_of: IntArray,
     first: IntArray,
     last: IntArray,
@@ -386,9 +392,9 @@ def _link(
     of segments. A segment predicts its next peak by its last position and an averaged slope.
     """
     n = line.shape[0]
-    # Active segments: number and last search line; last position, slope, and weight of the next
-    # peak in the slope; and the predicted position on this search line.
-    alive, track, due = np.empty((2, n), np.int64), np.empty((3, n)), np.empty(n)
+    # Active segments: number and last search line; last position, slope, weight of the next peak in
+    # the slope, and its gate; and the predicted position on this search line.
+    alive, track, due = np.empty((2, n), np.int64), np.empty((4, n)), np.empty(n)
     n_alive = ZERO
     n_segments = 0
     here = -1
@@ -400,16 +406,15 @@ def _link(
         if x != here:
             n_alive = _predict(x, n_alive, alive, track, due)
             here = x
-        best = -1
-        best_miss = _LINK_GATE_PX
+        best, best_miss = -1, np.inf
         for k in range(n_alive):
             miss = abs(place - due[k])
-            best = k if miss < best_miss else best
-            best_miss = min(miss, best_miss)
+            if miss < min(best_miss, track[3, k]):
+                best, best_miss = k, miss
         if best < 0:
             s, best = n_segments, n_alive
             alive[0, best], first[s], count[s] = s, i, 1
-            track[1, best], track[2, best] = 0.0, 1.0
+            track[1, best], track[2, best], track[3, best] = 0.0, 1.0, _LINK_GATE_PX * line_px
             n_segments += 1
             n_alive += 1
         else:
@@ -418,7 +423,7 @@ def _link(
             slope = (place - track[0, best]) * (1.0 if x - alive[1, best] == 1 else 0.5)
             track[1, best] += track[2, best] * (slope - track[1, best])
             count[s] += 1
-            track[2, best] = max(1.0 / count[s], 0.15)
+            track[2, best], track[3, best] = max(1.0 / count[s], 0.15), _LINK_GATE_PX
         # A segment has one peak on a search line: no other one is near the prediction.
         alive[1, best], track[0, best], due[best] = x, place, np.inf
         segment_of[i], last[s] = s, i
