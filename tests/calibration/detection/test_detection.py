@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.calibration.detection import boards as chessboard_module
+from aqualvs.calibration.detection import boards, detection
+from aqualvs.calibration.detection.boards import Markers
 from aqualvs.calibration.detection.detection import detect_board, detect_markers
 from aqualvs.calibration.detection.saddle_corners import refine_saddles
 from aqualvs.calibration.targets.target_files import load_board
@@ -151,8 +152,8 @@ def _shifted(finder, by):
 def test_a_grid_that_is_one_line_off_is_shifted_back(monkeypatch, by, squares):
     board = chessboard(squares)
     image, truth = _shot(board, _WHOLE)
-    finders = [(name, _shifted(find, by)) for name, find in chessboard_module._FINDERS]
-    monkeypatch.setattr(chessboard_module, "_FINDERS", tuple(finders))
+    finders = [(name, _shifted(find, by)) for name, find in boards._FINDERS]
+    monkeypatch.setattr(boards, "_FINDERS", tuple(finders))
     view = detect_board(image, board, "a.png")
     assert isinstance(view, View)
     assert len(view) == board.n_corners
@@ -163,12 +164,12 @@ def test_a_grid_that_is_one_line_off_is_shifted_back(monkeypatch, by, squares):
 def test_other_finders_are_tried_after_a_wrong_grid(monkeypatch):
     board = chessboard((7, 6))
     image, truth = _shot(board, _WHOLE)
-    first, *rest = chessboard_module._FINDERS
+    first, *rest = boards._FINDERS
 
     def wrong(image, grid):
         return True, np.random.default_rng(1).uniform(50.0, 250.0, (grid[0] * grid[1], 1, 2))
 
-    monkeypatch.setattr(chessboard_module, "_FINDERS", ((first[0], wrong), *rest))
+    monkeypatch.setattr(boards, "_FINDERS", ((first[0], wrong), *rest))
     view = detect_board(image, board, "a.png")
     assert isinstance(view, View)
     assert _errors(view, truth).max() < _FARTHEST_PX
@@ -230,6 +231,30 @@ def test_a_wrong_board_is_refused_with_the_remedy(asked, words):
     # Searching for what is not there takes long in large pictures.
     image = cv2.resize(image, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
     assert words in detect_board(image, asked, "a.png")
+
+
+@pytest.mark.parametrize(("every", "is_found"), [(7, True), (3, False)])
+def test_a_board_is_found_if_few_markers_are_misread(monkeypatch, every, is_found):
+    board = charuco((12, 9), dictionary="DICT_4X4_250")
+    read = boards.read_markers
+
+    def misread(*args, **options):
+        found = read(*args, **options)
+        wrong = found.ids % every == 0
+        # The marker of a square elsewhere on the board.
+        return Markers(
+            np.where(wrong, (found.ids + 25) % board.n_markers, found.ids), found.corners
+        )
+
+    monkeypatch.setattr(boards, "read_markers", misread)
+    monkeypatch.setattr(detection, "read_markers", misread)
+    image, truth = _shot(board, _WHOLE)
+    view = detect_board(image, board, "a.png")
+    if is_found:
+        assert len(view) == board.n_corners
+        assert _errors(view, truth).max() < _FARTHEST_PX
+    else:
+        assert view.endswith("but many are misread; come nearer, or take a sharper picture")
 
 
 def test_a_larger_dictionary_of_the_same_family_is_named():

@@ -50,6 +50,8 @@ def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: in
         (agreed_corners(markers, other).n_agreed, remedy) for other, remedy in _other_boards(board)
     ]
     most, remedy = max(counts, key=lambda count: count[0])
+    if agreed_corners(markers, board).n_agreed > most:
+        return f"{read}, but many are misread; come nearer, or take a sharper picture"
     if most >= _ENOUGH:
         return f"{read}, but not as on this board; {remedy}"
     remedy = "check its squares, marker_mm and dictionary"
