@@ -201,18 +201,32 @@ def test_a_wall_in_a_wide_picture(target: Plane) -> None:
     assert_posture(found.posture, target)
 
 
-@pytest.mark.parametrize("yaw_deg", [0.0, 8.0])
-def test_a_wall_under_lasers_a_third_of_a_turn_apart(yaw_deg: float) -> None:
-    """Each stripe also crosses the other lasers' search lines, which see it as a steep line."""
-    rig = bluerov2_rig()
-    planes = [
-        Plane(np.array([np.cos(turn), -0.27, np.sin(turn)]) / np.hypot(1.0, 0.27), -0.13)
-        for turn in np.deg2rad([60.0, -30.0, 210.0])
-    ]
-    lasers = [replace(one, plane=sheet) for one, sheet in zip(rig.lasers, planes, strict=True)]
-    target = plane(0.6, 0.0, yaw_deg)
-    found = scan([(target, everywhere)], rig=replace(rig, lasers=tuple(lasers)))
+def slanting(rig: Rig, turns_deg: Sequence[float]) -> Rig:
+    """A rig with lasers around the camera, all aimed at 0.5 m ahead of it."""
+    normals = [np.array([np.cos(turn), -0.27, np.sin(turn)]) for turn in np.deg2rad(turns_deg)]
+    lasers = (
+        replace(rig.lasers[0], name=f"laser_{k}", plane=Plane(n / np.hypot(1.0, 0.27), -0.13))
+        for k, n in enumerate(normals)
+    )
+    return replace(rig, lasers=tuple(lasers))
+
+
+@pytest.mark.parametrize(
+    "turns_deg", [(60.0, -30.0, 210.0), (50.0, -45.0, 225.0), (50.0, -45.0, 225.0, 130.0)], ids=str
+)
+@pytest.mark.parametrize("make", [example_rig, bluerov2_rig])
+def test_a_wall_under_slanting_lasers(make: Callable[[], Rig], turns_deg: Sequence[float]) -> None:
+    """Their stripes make peaks on the search lines of both directions."""
+    rig, target = slanting(make(), turns_deg), plane(0.8, 10.0)
+    found = scan([(target, everywhere)], rig=rig, lasers=range(len(turns_deg)))
     assert_posture(found.posture, target)
+
+
+def test_stripes_seen_from_both_directions_are_not_too_many_for_the_lasers() -> None:
+    """Tall peaks in a crowd are paint: there were twice as many as search lines."""
+    rig = slanting(example_rig(), (50.0, -45.0, 225.0, 130.0))
+    light = light_on(rig, [(plane(0.6), everywhere)], range(4))
+    assert Scanner(rig).detect(frame_of(light, noise=4.0)).coloured_share > 0.9
 
 
 @pytest.mark.parametrize("target", [plane(0.4), plane(0.55, -6.0, 11.0)], ids=str)

@@ -44,7 +44,7 @@ from aqualvs.scanning.assignment_kernels import (
     stripe_visibility,
     two_longest_stripes,
 )
-from aqualvs.scanning.candidates import Candidates, Subsegments
+from aqualvs.scanning.candidates import Candidates, Subsegments, lit_cells, number_cells
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, sample_bands
 from aqualvs.scanning.net_surfaces import has_strands_before, inflate_covariance, seen_through
 from aqualvs.scanning.plane_search import MIN_FACING, WEIGHT, X, Z
@@ -504,10 +504,9 @@ class AssignmentTest:
         if not target.is_mesh:
             return None
         for one in surfaces:
-            rivals = (
-                one is not target and one.is_mesh and one.sampling_weight >= target.sampling_weight
-            )
-            if rivals and _is_nearer(one, target, subsegments):
+            if one is target or not one.is_mesh or one.sampling_weight < target.sampling_weight:
+                continue
+            if _is_nearer(one, target, subsegments):
                 return one if self._is_faint(target, subsegments) else None
         return None
 
@@ -585,8 +584,9 @@ def other_lines_share(
 ) -> float:
     """Return the light in other lines on the search lines of a surface, over the surface's light.
 
-    Other lines are long straight components of a laser, on the search lines where the surface has a
-    stripe of that laser, of peaks that are not on the surface.
+    Other lines are long straight components of a laser, on the search lines of its stripe on the
+    surface, neither on the surface nor in the place of its light: a slanting stripe makes peaks in
+    both search directions.
 
     Parameters
     ----------
@@ -611,8 +611,10 @@ def other_lines_share(
         if members[c]:
             lit[laser[i], line[i]] = True
             of_surface += candidates.confidence[i]
+    cell = np.empty_like(source)
+    stripes = lit_cells(cell, members[of_candidate], *number_cells(candidates.pixels, cell))
     for i in range(source.shape[0]):
-        is_other = lit[laser[i], line[i]] and not own[source[i]]
+        is_other = lit[laser[i], line[i]] and not own[source[i]] and not stripes[cell[i]]
         if is_other and is_straight(shapes, candidates.component[i]):
             others += candidates.confidence[i]
     return others / max(of_surface, 1e-12)
@@ -677,9 +679,7 @@ def _log_odds(one: FloatArray, other: FloatArray) -> float:
     # Two stripes share a plane with any assignment, a third one only by chance.
     third = _ODDS.third_stripe * (float(_n_lit(one) > 2) - float(_n_lit(other) > 2))
     freedom = min(one[FREEDOM], other[FREEDOM], _ODDS.max_freedom)
-    residuals = 0.0
-    if freedom > 0.0:
-        residuals = 0.5 * freedom * math.log(other[VARIANCE] / one[VARIANCE])
+    residuals = 0.5 * freedom * math.log(other[VARIANCE] / one[VARIANCE]) if freedom > 0.0 else 0.0
     return float(
         _ODDS.foreign_stripe * foreign
         + dark

@@ -250,11 +250,12 @@ class FrameDetector:
         visible = [band for band in laser_bands if band.visible]
         self._colours = sorted({one.colour for one in visible}, key=lambda colour: colour.name)
         # Each laser makes about one peak on a search line.
-        self._n_possible = float(
-            sum(np.count_nonzero(one.lowest <= one.highest) for one in visible)
-        )
+        self._n_possible = float(sum(one.n_lit for one in visible))
         by_axis = {axis: [one for one in visible if one.axis is axis] for axis in SearchAxis}
         self._bands = {axis: _band(ones) for axis, ones in by_axis.items() if ones}
+        # Its stripe, if it slants, crosses search lines of the other direction as well.
+        n_across = sum(one.n_lit * min(one.slant, 1.0) for one in visible)
+        self._n_seen = self._n_possible + (n_across if len(self._bands) == len(SearchAxis) else 0.0)
         # A search line along x of a field is one of its rows.
         self._line_px = {
             axis: 1 if field and axis is SearchAxis.ALONG_X else by_axis[axis][0].line_px
@@ -454,7 +455,7 @@ class FrameDetector:
         # Few peaks are used whatever their colour: codecs drop that of thin lines.
         if not has_colour or n <= n_possible:
             return least, None
-        paint = learn_paint(sample, n_possible)
+        paint = learn_paint(sample, self._n_seen / _SAMPLE.sample_every)
         likelihood = self._likelihood(sample, paint, n_possible)
         return max(least, useful_height(sample[HEIGHT], likelihood)), paint
 

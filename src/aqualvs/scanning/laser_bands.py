@@ -79,7 +79,17 @@ class LaserBand:
     @property
     def visible(self) -> bool:
         """Whether the laser can appear in the image."""
-        return bool(np.any(self.lowest <= self.highest))
+        return self.n_lit > 0
+
+    @property
+    def n_lit(self) -> int:
+        """Number of search lines on which the laser can appear."""
+        return int(np.count_nonzero(self.lowest <= self.highest))
+
+    @property
+    def slant(self) -> float:
+        """Mean slope of the stripe, in pixels along a search line for each pixel across it."""
+        return float(np.mean(np.abs(self.slope_low + self.slope_high))) / (2 * self.line_px)
 
 
 def search_range(working_range: tuple[float, float]) -> tuple[float, float]:
