@@ -132,12 +132,12 @@ def test_calls_of_a_further_frame_of_a_run(tmp_path: Path) -> None:
     # What remains of a scan's cost: decoding, rows of the tables, tally, progress. The first run
     # loads what is loaded once; the difference of two leaves out what every run does once.
     found = []
-    for stop in (50, 20, 50):
+    for stop in (15, 15, 35):
         with counted() as calls:
             measure(tmp_path / "out", stop)
         found.append(calls)
-    own = (found[2].own - found[1].own) / 30
-    foreign = (found[2].foreign - found[1].foreign) / 30
+    own = (found[2].own - found[1].own) / 20
+    foreign = (found[2].foreign - found[1].foreign) / 20
     assert own == pytest.approx(RUN_CALLS, rel=0.15)
     assert RUN_FOREIGN / 3 < foreign < 2 * RUN_FOREIGN
 
@@ -181,7 +181,7 @@ def test_memory_of_a_run_is_flat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     # Points wait for a row group of Parquet to be full: of a hundred frames, and here of three.
     monkeypatch.setattr("aqualvs.results.points._ROWS_PER_GROUP", 1 << 12)
     # Tables are written as they come: a run of twice the frames holds no more, once all that
-    # is read ahead is there. The 80 more frames would bring 4 MiB if only their points were kept.
+    # is read ahead is there. The 60 more frames would bring 3 MiB if only their points were kept.
     measure(tmp_path / "out", 10)
-    short, long = (peak_kib(lambda n=n: measure(tmp_path / "out", n)) for n in (70, 150))
+    short, long = (peak_kib(lambda n=n: measure(tmp_path / "out", n)) for n in (40, 100))
     assert long < short + 256.0

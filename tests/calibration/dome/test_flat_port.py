@@ -14,6 +14,7 @@ from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty, rig_moved_by
 from aqualvs.simulation.scenarios import flat_port_rig
 from dome_cases import AIR, INTRINSICS, WATER, Given, Shoot, board_points, normalised_errors, see
+from whole import WHOLE
 
 QUICK = DomeOptions(check_cross_validation=False)
 SIGMA_WATER = 5e-4
@@ -60,14 +61,14 @@ def solved(seed: int, options: DomeOptions = QUICK) -> tuple[Rig, Shoot, float, 
 
 def test_normalised_errors_are_normal() -> None:
     runs = []
-    for seed in range(15):
+    for seed in range(15 if WHOLE else 8):
         rig, boards, n, found = solved(seed)
         errors = normalised_errors(found, rig, boards.poses, (n,))
         runs.append([errors[name] for name in sorted(errors)])
         assert found.uncertainty.sigmas["port_distance"] < 0.4e-3
         assert np.rad2deg(found.uncertainty.sigmas["port_tilt_x"]) < 0.05
     values = np.array(runs)
-    # 15 runs know a spread to 18 %; the many poses know theirs to 2 %.
+    # 8 runs know a spread to 25 %; the many poses know theirs to 3 %.
     assert np.abs(values).max() < 5.0
     assert np.sqrt(np.mean(values**2)) == pytest.approx(1.0, abs=0.1)
 
