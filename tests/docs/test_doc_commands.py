@@ -29,6 +29,7 @@ from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import load_scenario
 from doc_blocks import PAGES, Command, all_commands, commands
 from dome_cases import leave_bare_lenses_out
+from net_app_cases import leave_maps_blank
 from panel_cases import small_rig
 from ports import free_port
 from repository import ROOT
@@ -54,7 +55,8 @@ ELSEWHERE = {
     r"^design (--rig|--image .*--lens-mm|design.yaml)": "as the README's; tests/cli/test_design.py",
 }
 IN_ORDER = (ROOT / "README.md", ROOT / "docs" / "first-dive.md", ROOT / "docs" / "tour.md")
-# Commands that begin processes or threads of their own, or are the first that a user types.
+# Commands that begin processes or threads of their own, or are the first that a user types: each is
+# a process once.
 AS_A_PROCESS = {"batch", "demo", "live"}
 
 
@@ -130,8 +132,14 @@ def world(tmp_path_factory):
         patch.setattr(simulate, "load_scenario", few_frames)
         patch.setattr(simulate, "example_rig", small_rig)
         leave_bare_lenses_out(patch)
+        # tests/cli/test_net.py draws them.
+        leave_maps_blank(patch)
+        begun = set()
         for command in {arguments_of(c): c for page in IN_ORDER for c in commands(page)}.values():
-            run(command, folder)
+            word = command.arguments[0]
+            alone = word in AS_A_PROCESS and word not in begun
+            (run_as_process if alone else run_here)(command, folder)
+            begun.add(word)
     named = {path for page in IN_ORDER for path in files_named(page)}
     assert [path for path in sorted(named) if not (folder / path).exists()] == []
     shutil.copy(folder / "out/cal/rig.yaml", folder / "rig.yaml")
@@ -173,11 +181,6 @@ def repeatable(command: Command, folder: Path) -> list[str]:
     if "--dashboard" in arguments:
         arguments += ["--dashboard-address", f"127.0.0.1:{free_port()}"]
     return arguments
-
-
-def run(command: Command, folder: Path) -> None:
-    alone = command.arguments[0] in AS_A_PROCESS
-    (run_as_process if alone else run_here)(command, folder)
 
 
 def run_as_process(command: Command, folder: Path) -> None:
@@ -233,7 +236,7 @@ def test_the_first_pages_run_as_they_stand(world):
 
 def test_the_other_pages_commands_run(world):
     for command in others():
-        run(command, world)
+        run_here(command, world)
 
 
 def test_what_is_said_to_run_elsewhere_is_still_named():
