@@ -163,7 +163,7 @@ def shoot_random_folds(seed: int) -> Shot:
 
 def test_errors_on_random_folds_are_as_large_as_stated() -> None:
     """On one flank of a fold a plane fits to a tenth of a millimetre, and the net is elsewhere."""
-    n = 90 if WHOLE else 10
+    n = 90 if WHOLE else 8
     scores = []
     for seed in range(115, 115 + n):
         shot = shoot_random_folds(seed)
@@ -179,7 +179,7 @@ def test_errors_on_random_folds_are_as_large_as_stated() -> None:
     assert (np.median(np.abs(scores), axis=0) < 1.0).all()
 
 
-@pytest.mark.parametrize("seed", [199, 241, 398])
+@pytest.mark.parametrize("seed", part_of([199, 241, 398]))
 def test_a_flank_with_most_of_the_strands_is_no_sure_posture(seed: int) -> None:
     shot = shoot_random_folds(seed)
     if isinstance(shot.scan.posture, Posture):
@@ -216,7 +216,9 @@ def test_a_slack_net() -> None:
     assert shot.recall() > 0.85
 
 
-@pytest.mark.parametrize("bend", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)], ids=str)
+@pytest.mark.parametrize(
+    "bend", part_of([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)], every=3), ids=str
+)
 def test_a_bend_of_a_metres_radius_is_known_to_three_sigma(bend: tuple[float, float]) -> None:
     posture = shoot(replace(NET, curvature=bend)).posture
     assert posture.curvature is not None
@@ -295,7 +297,7 @@ def test_a_laser_along_a_strand_makes_no_wall_of_a_net(slide: tuple[float, float
     assert np.mean(scan.points.label == Label.SOLID) < 0.05
 
 
-@pytest.mark.parametrize("number", [7024, 41003, 41087])
+@pytest.mark.parametrize("number", part_of([7024, 41003, 41087]))
 def test_what_is_behind_a_coarse_net_is_not_its_posture(number: int) -> None:
     """The wall has ten times the light of the few lit strands, and looks like a net in shadows."""
     (shot,) = shots(1, number, None)

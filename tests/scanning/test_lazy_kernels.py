@@ -49,7 +49,7 @@ def frames() -> Iterator[tuple[str, Scanner, Frame]]:
         yield f"net {shot.number}", Scanner(rig), shot.frame
     yield "wall", Scanner(rig), wall_frame(rig)
     with open_source(str(folder / "dive.mp4")) as source:
-        dive = list(source)[:: 40 if WHOLE else 149]
+        dive = list(source)[::40] if WHOLE else [next(iter(source))]
     for target in TargetKind:
         scanner = Scanner(load_rig(folder / "rig.yaml"), ScannerOptions(target=target))
         for frame in dive:
