@@ -18,7 +18,8 @@ from rig_from_sample_truth import load_truth
 from whole import WHOLE, part_of
 
 _TIMES = np.linspace(0.1, 3.7, 8 if WHOLE else 6)
-_DIVES = ("wall", "wall_yaw", "wall_pitch", "wall_range", "net_diamond", "net_clutter")
+# An ordinary run has every second one.
+_DIVES = ("net_clutter", "net_diamond", "wall_range", "wall_pitch", "wall_yaw", "wall")
 
 
 @cache
@@ -105,7 +106,7 @@ def watched_sample(samples: Path, name: str, rig: Rig, every: int) -> AgreementV
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize("name", _DIVES)
+@pytest.mark.parametrize("name", part_of(_DIVES))
 def test_independent_dives_raise_no_alarm(samples: Path, sample_rig: Rig, name: str) -> None:
     verdict = watched_sample(samples, name, sample_rig, every=3)
     assert verdict.n_frames >= 10
