@@ -12,7 +12,7 @@ from whole import WHOLE
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="judges copies of this process")
 
-N_CASES = 150 if WHOLE else 24
+N_CASES = 150 if WHOLE else 16
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.results.folder import RunOutputs
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net, Scene
+from net_app_cases import leave_maps_blank
 from net_cases import passing
 from net_change_cases import Cage, dive, write
 from net_dives import Dive, true_solidity
@@ -68,7 +69,8 @@ def true_of(net):
     return true_solidity(way)
 
 
-def test_from_two_dives_to_what_changed(tmp_path, capsys):
+def test_from_two_dives_to_what_changed(tmp_path, capsys, monkeypatch):
+    leave_maps_blank(monkeypatch)
     clean = Net(mesh="square", bar=0.025, twine=0.0025, roll=0.3, holes=KEPT)
     fouled = replace(clean, holes=(*KEPT, NEW), fouling=0.6, growth=1.0)
     before = run_of(tmp_path / "2026-05-01", clean)

@@ -42,7 +42,7 @@ COMMAND = (sys.executable, "-c", "import sys; from aqualvs.cli.main import main;
 FPS = 25
 # The noise of a camera repeats after so many pictures, and clips begin again at a multiple.
 N_NOISE = 11
-N_FRAMES, N_STILL = 5 * N_NOISE, 4 * FPS
+N_FRAMES, N_STILL = 5 * N_NOISE, 3 * FPS
 
 
 @pytest.fixture(scope="module")

@@ -419,9 +419,9 @@ def test_the_log_tells_a_part_that_is_well_again(capsys: pytest.CaptureFixture[s
 def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     """As fast as they go, every frame through every cheap output, JSON and recorder included.
 
-    240 frames; AQUALVS_SOAK_FRAMES=90000 makes it an hour of a stream of 25 frames a second.
+    160 frames; AQUALVS_SOAK_FRAMES=90000 makes it an hour of a stream of 25 frames a second.
     """
-    n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "240"))
+    n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "160"))
     from aqualvs.control.time_filter import PostureFilter
     from aqualvs.live.outputs.udp_json import UdpJsonOutput, receiver_address
     from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerProvider

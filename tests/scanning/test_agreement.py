@@ -23,6 +23,7 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
+from whole import part_of
 
 RIG = example_rig()
 N_FRAMES = 24
@@ -96,16 +97,18 @@ def test_a_drift_too_small_to_matter_is_no_alarm() -> None:
 @pytest.mark.parametrize("target", [swinging, still])
 @pytest.mark.parametrize(
     "form",
-    [
-        {"curvature_x": 0.1},
-        {"curvature_x": 0.5},
-        {"curvature_x": 2.0},
-        {"curvature_z": -1.0},
-        {"curvature_x": 0.3, "curvature_z": 0.3},
-        {"curvature_x": -0.2, "curvature_z": 0.2},
-        {"twist": 0.1},
-        {"twist": 0.5},
-    ],
+    part_of(
+        [
+            {"curvature_x": 0.1},
+            {"curvature_x": 0.5},
+            {"curvature_x": 2.0},
+            {"curvature_z": -1.0},
+            {"curvature_x": -0.2, "curvature_z": 0.2},
+            {"curvature_x": 0.3, "curvature_z": 0.3},
+            {"twist": 0.5},
+            {"twist": 0.1},
+        ]
+    ),
     ids=str,
 )
 @pytest.mark.parametrize("rig", [RIG, bluerov2_rig()], ids=lambda rig: rig.name)

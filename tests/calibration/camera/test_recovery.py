@@ -21,7 +21,7 @@ SIZE = (720, 576)
 LENS = Lens(fx=817.5, fy=878.0, cx=368.9, cy=281.7, distortion=(-0.126, 0.0827, 6.2e-4, -4.5e-4))
 NAMES = ("fx", "fy", "cx", "cy")
 N_VIEWS = 28
-N_SEEDS = 10 if WHOLE else 6
+N_SEEDS = 10 if WHOLE else 5
 POINTS = board_points(11, 8, 0.024)
 MIDDLE = POINTS.mean(axis=0)
 # From the middle to the short sides.
@@ -99,7 +99,7 @@ def test_halves_of_the_views_differ_by_their_sigmas(
         (a, a_corners, a_views), (b, b_corners, b_views) = halves
         by_corners.append((a - b) / np.sqrt(a_corners + b_corners))
         by_views.append((a - b) / np.sqrt(a_views + b_views))
-    # 48 differences, correlated in places: 1 ± 0.2.
+    # 40 differences or more, correlated in places: 1 ± 0.22.
     assert 0.7 < _rms(by_views) < 1.4
     assert before[0] < _rms(by_corners) < before[1]
     if shoot is _clean:

@@ -39,7 +39,7 @@ SIGMA_WATER = 5e-4
 
 
 # The last has both kinds, and both media; `test_calibrate.py` tries each kind once.
-RUNS = [(("exact",), 30 if WHOLE else 12), (("distance", "unknown"), 12)]
+RUNS = [(("exact",), 30 if WHOLE else 8), (("distance", "unknown"), 12 if WHOLE else 8)]
 if WHOLE:
     RUNS += [(("distance",), 16), (("unknown",), 16)]
 
@@ -64,7 +64,7 @@ def test_normalised_errors_are_normal(kinds: tuple[str, ...], n_runs: int) -> No
         noise.append(found.noise_px)
     for kind, spread in _spreads(runs).items():
         # Over 200 runs every number by itself lies within 0.85 and 1.15. Errors of one kind go
-        # together within a run, so few runs scatter as one number does: by 13 to 20 %.
+        # together within a run, so few runs scatter as one number does: by 13 to 25 %.
         assert 0.6 < spread < 1.45, kind
     # Huber's weights take 1 % off the noise.
     assert np.mean(noise) == pytest.approx(0.1, rel=0.03)
@@ -74,7 +74,7 @@ def test_a_tilt_that_all_boards_share_is_in_sigma_if_it_is_stated() -> None:
     shared_tilt = float(np.deg2rad(0.4))
     stated = replace(QUICK, shared_tilt_sigma=shared_tilt)
     runs: dict[float, list[dict[str, float]]] = {0.0: [], shared_tilt: []}
-    for seed in range(12):
+    for seed in range(12 if WHOLE else 8):
         rng = np.random.default_rng(seed)
         true = drawn_rig(example_rig(), QUICK, rng)
         tilt = float(np.deg2rad(0.05))
