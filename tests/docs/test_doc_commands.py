@@ -20,6 +20,7 @@ from typing import Any
 
 import pytest
 import typer
+from matplotlib.figure import Figure
 
 from aqualvs.cli.main import app, main
 from aqualvs.experiments import simulate
@@ -122,6 +123,14 @@ def few_frames(name: str) -> Scenario:
     return dataclasses.replace(load_scenario(name), fps=4.0)
 
 
+save_figure = Figure.savefig
+
+
+def save_coarsely(figure: Figure, path: Path, **options: Any) -> None:
+    """Save a figure that nobody looks at, whatever its resolution would be."""
+    save_figure(figure, path, **{**options, "dpi": 40})
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     """A user's folder after the first dive and the tour."""
@@ -132,8 +141,9 @@ def world(tmp_path_factory):
         patch.setattr(simulate, "load_scenario", few_frames)
         patch.setattr(simulate, "example_rig", small_rig)
         leave_bare_lenses_out(patch)
-        # tests/cli/test_net.py draws them.
+        # tests/cli/test_net.py draws maps; the other figures are there, but coarse.
         leave_maps_blank(patch)
+        patch.setattr(Figure, "savefig", save_coarsely)
         begun = set()
         for command in {arguments_of(c): c for page in IN_ORDER for c in commands(page)}.values():
             word = command.arguments[0]
