@@ -18,7 +18,7 @@ from whole import WHOLE
 
 N_FRAMES, STEP_NS = 48, 250_000_000
 # Times four in each file.
-N_FLIPS = 40 if WHOLE else 16
+N_FLIPS = 40 if WHOLE else 10
 
 
 @pytest.fixture(scope="module")

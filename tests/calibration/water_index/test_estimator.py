@@ -102,7 +102,7 @@ def spread(errors: Sequence[float]) -> float:
 def test_normalised_errors_of_many_vehicles() -> None:
     alone, with_prior, by_camera = [], [], []
     names = CAMERA.names
-    for seed in range(200 if WHOLE else 60):
+    for seed in range(200 if WHOLE else 40):
         vehicle = Vehicle(np.random.default_rng(seed), uncertainty=CAMERA)
         n = vehicle.rng.uniform(1.331, 1.345)
         prior = IndexPrior(n + 3e-3 * vehicle.rng.normal(), 3e-3)
@@ -117,7 +117,7 @@ def test_normalised_errors_of_many_vehicles() -> None:
         left = result.uncertainty.covariance[-1, -1] - reach @ c @ reach
         by_camera.append((result.n - n + reach @ vehicle.errors) / np.sqrt(left))
         assert result.uncertainty.names == (*names, N_WATER)
-    # 60 samples know a standard deviation to 9 %; the bar is 0.8 to 1.25.
+    # 40 samples know a standard deviation to 11 %; the bar is 0.8 to 1.25.
     assert 0.8 < spread(alone) < 1.25
     assert 0.8 < spread(with_prior) < 1.25
     assert 0.8 < spread(by_camera) < 1.25
@@ -125,7 +125,7 @@ def test_normalised_errors_of_many_vehicles() -> None:
 
 def test_begun_in_air_the_vehicle_knows_its_water_better() -> None:
     in_air, errors, sizes = [], [], []
-    for seed in range(25):
+    for seed in range(25 if WHOLE else 16):
         vehicle = Vehicle(np.random.default_rng(seed), options=OPTIONS)
         n = vehicle.rng.uniform(1.331, 1.345)
         estimator = vehicle.estimator(IndexPrior.air())
@@ -141,7 +141,7 @@ def test_begun_in_air_the_vehicle_knows_its_water_better() -> None:
         sizes.append((step.size - (n - 1.0003)) / step.sigma)
         in_air.append(last.sigma / last.sigma_pictures)
         assert last.observable
-    # 25 samples know a standard deviation to 14 %.
+    # 16 samples know a standard deviation to 18 %.
     assert 0.65 < spread(errors) < 1.4
     assert 0.65 < spread(sizes) < 1.4
     assert np.median(in_air) < 0.5

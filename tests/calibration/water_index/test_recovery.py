@@ -61,7 +61,7 @@ def test_normalised_errors_over_uncertain_rigs_and_places(
     points, options = target_points(), IndexOptions()
     uncertainty = RigUncertainty.independent(sigmas)
     errors = []
-    for _ in range(60):
+    for _ in range(60 if WHOLE else 40):
         true = rig_moved_by(rig, tuple(sigmas), rng.normal(0.0, list(sigmas.values())))
         turn = rng.normal(0.0, options.sigma_turn, 3)
         shift = rng.normal(0.0, options.sigma_place, 3)
@@ -76,7 +76,7 @@ def test_normalised_errors_over_uncertain_rigs_and_places(
         shots = [(t, View(v.name, v.ids, points, v.pixels)) for t, v in shots]
         last = water(rig, shots, uncertainty=uncertainty)
         errors.append((last.n - n) / last.sigma)
-    # 60 samples know a standard deviation to 9 %; the bar is 0.8 to 1.25.
+    # 40 samples know a standard deviation to 11 %; the bar is 0.8 to 1.25.
     assert 0.8 < np.std(errors) < 1.25
     assert abs(np.mean(errors)) < 0.35
 
