@@ -20,6 +20,7 @@ from aqualvs.report.figure_style import save_figures
 from aqualvs.report.mesh_figures import Reflections, draw_figures, figures
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
 from aqualvs.simulation.scenarios import example_rig
+from whole import part_of
 
 LASERS = {"lower": Plane.from_normal([0.0, -0.3, 0.954], -0.143)}
 LASERS["left"] = Plane.from_normal([0.96, -0.25, -0.12], -0.138)
@@ -190,7 +191,7 @@ def reflections(in_laser: FloatArray, net: bool) -> Reflections:
     )
 
 
-@pytest.mark.parametrize("points", [np.empty((0, 2)), strands(1)[:1], box(50)])
+@pytest.mark.parametrize("points", part_of([np.empty((0, 2)), strands(1)[:1], box(50)]))
 def test_little_to_see_is_drawn_too(tmp_path: Path, points: FloatArray) -> None:
     written = save_figures(
         draw_figures(reflections(points, False), MeshFilterOptions()), tmp_path, dpi=100

@@ -108,14 +108,14 @@ def is_offset(found: TimeOffset | OffsetRefusal) -> TimeOffset:
 def test_offset_and_its_sigma_hold_over_many_dives() -> None:
     """At our posture's noise; sigma must neither promise too much nor hide what is known."""
     rng = np.random.default_rng(2)
-    found = [is_offset(find_time_offset(*usual(rng, 2.0))) for _ in range(30)]
+    found = [is_offset(find_time_offset(*usual(rng, 2.0))) for _ in range(30 if WHOLE else 20)]
     errors = np.array([one.offset_s - OFFSET_S for one in found])
     scores = errors / np.array([one.sigma_s for one in found])
     assert np.abs(errors).max() < 0.06
-    # The mean square of 30 normal scores lies in (0.5, 1.7) with 99.5 %; the rest is for tails that
-    # are not quite normal.
+    # The mean square of 30 normal scores lies in (0.5, 1.7) with 99.5 %, of 20 in (0.3, 2.1); the
+    # rest is for tails that are not quite normal.
     assert 0.45 < np.mean(scores**2) < 2.0
-    # No bias: the mean of 30 is known to 0.18 sigma.
+    # No bias: the mean of 20 is known to 0.22 sigma.
     assert abs(scores.mean()) < 0.7
 
 
