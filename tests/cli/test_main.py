@@ -86,6 +86,7 @@ def test_the_steps_of_calibrate_are_told_whole(capsys):
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish", "powershell"])
 def test_a_shell_can_complete(shell, monkeypatch, capsys):
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    monkeypatch.setattr(cli, "program", cli.program.__wrapped__)
     with contextlib.suppress(SystemExit):
         main(["--show-completion", shell])
     assert f"complete_{shell}" in capsys.readouterr().out
@@ -139,12 +140,13 @@ def test_faults_of_the_user_become_one_line(monkeypatch, refused):
     def fail(**_):
         raise AqualvsError("dive.mp4: odd; fix it")
 
-    monkeypatch.setattr(cli, "app", fail)
+    monkeypatch.setattr(cli, "program", lambda: fail)
     assert refused("run") == "dive.mp4: odd; fix it"
 
 
 @pytest.mark.parametrize(
-    ("place", "name"), [(CheckedCommand, "invoke"), (cli, "app"), (CheckedCommand, "make_context")]
+    ("place", "name"),
+    [(CheckedCommand, "invoke"), (cli, "program"), (CheckedCommand, "make_context")],
 )
 def test_an_interrupted_command_exits_with_130_and_says_so(place, name, monkeypatch, capsys):
     def stop(*_, **__):
@@ -184,7 +186,7 @@ def test_faults_of_the_program_are_not_hidden(monkeypatch):
     def fail(**_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(cli, "app", fail)
+    monkeypatch.setattr(cli, "program", lambda: fail)
     with pytest.raises(ZeroDivisionError):
         main(["run"])
 
@@ -272,7 +274,7 @@ def test_faults_of_the_system_are_one_line(monkeypatch, refused):
     def fail(**_):
         raise PermissionError(13, "Permission denied", "/somewhere/dive.mp4")
 
-    monkeypatch.setattr(cli, "app", fail)
+    monkeypatch.setattr(cli, "program", lambda: fail)
     said = "/somewhere/dive.mp4: Permission denied; change its rights, or choose another path"
     assert refused("run") == said
 

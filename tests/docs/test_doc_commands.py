@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from matplotlib.figure import Figure
 
-from aqualvs.cli.main import app, main
+from aqualvs.cli.main import main, program
 from aqualvs.experiments import simulate
 from aqualvs.simulation import dive
 from aqualvs.simulation.render import Renderer
@@ -63,12 +62,6 @@ AS_A_PROCESS = {"batch", "demo", "live"}
 
 def arguments_of(command: Command) -> str:
     return shlex.join(command.arguments)
-
-
-@functools.cache
-def program() -> Any:
-    """The program with its commands; making it from their signatures takes a while."""
-    return typer.main.get_command(app)
 
 
 def understood(arguments: list[str]) -> None:

@@ -150,7 +150,7 @@ def _exit_code(case: Case) -> int:
         arguments()
         return 0
 
-    cli.app = body
+    cli.program = lambda: body
     return main([])
 
 

@@ -276,11 +276,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
+@functools.cache
+def program() -> Any:
+    """Return the program with its commands, which Typer would make from `app` at every call."""
+    return typer.main.get_command(app)
+
+
 def _exit_code(arguments: Sequence[str] | None) -> int:
     """Run the program; print an expected error in one line and return the exit code."""
     try:
         listed = None if arguments is None else list(arguments)
-        code = app(args=listed, prog_name="aqualvs", standalone_mode=False)
+        code = program()(args=listed, prog_name="aqualvs", standalone_mode=False)
     except AqualvsError as fault:
         return _complain(str(fault), _EXIT_BAD_INPUT)
     except (KeyboardInterrupt, typer.Abort):
