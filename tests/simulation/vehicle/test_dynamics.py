@@ -110,7 +110,7 @@ def test_energy_stays_without_drag(seed: int) -> None:
 def test_terminal_speed_balances_drag(model: VehicleModel, axis: int, force: float) -> None:
     way = np.eye(3)[axis]
     body = pack_body(neutral(model, Thruster((0.0, 0.0, 0.0), tuple(way))))
-    state = carried_on(state_at(SE3.identity()), np.array([force]), body, CALM.pack(), 60000)
+    state = carried_on(state_at(SE3.identity()), np.array([force]), body, CALM.pack(), 24000)
     linear, quadratic = model.linear_drag[axis], model.quadratic_drag[axis]
     root = np.sqrt(linear**2 + 4.0 * quadratic * abs(force))
     speed = np.sign(force) * (root - linear) / (2.0 * quadratic)
@@ -125,7 +125,7 @@ def test_terminal_turn_balances_drag(model: VehicleModel) -> None:
         Thruster((0.0, -1.0, 0.0), (1.0, 0.0, 0.0)),
     )
     body = pack_body(neutral(model, *couple))
-    state = carried_on(state_at(SE3.identity()), np.full(2, 0.4), body, CALM.pack(), 40000)
+    state = carried_on(state_at(SE3.identity()), np.full(2, 0.4), body, CALM.pack(), 24000)
     rate = state[12]
     drag = model.linear_drag[5] * rate + model.quadratic_drag[5] * rate * abs(rate)
     assert drag == pytest.approx(0.8, rel=1e-3)
