@@ -23,6 +23,12 @@ leg:
 """
 
 
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without figures: drawing them takes most of the time of a short run."""
+    monkeypatch.setattr("aqualvs.follow.report.drawn_follow_figures", lambda _: {})
+
+
 def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
     told: list[str] = []
     request = SimRequest(out=tmp_path / "out", aim=Aim(range=0.7), seconds=3.0)
@@ -45,6 +51,7 @@ def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
         assert (request.out / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_a_picture_that_stands_still_steers_nobody(tmp_path: Path) -> None:
     told: list[str] = []
     request = SimRequest(out=tmp_path / "out", aim=Aim(range=0.6), seconds=4.0, freeze=2.0)
@@ -60,6 +67,7 @@ def test_a_picture_that_stands_still_steers_nobody(tmp_path: Path) -> None:
     assert "share of the frames at which it was steered" in page
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_simulation_ends_where_the_plan_ends(tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
@@ -137,6 +145,7 @@ def test_enter_engages_and_gives_back() -> None:
     assert not pilot.engaged
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_yaw_is_held_where_it_is_asked_for(tmp_path: Path) -> None:
     request = SimRequest(
         out=tmp_path,
@@ -152,6 +161,7 @@ def test_yaw_is_held_where_it_is_asked_for(tmp_path: Path) -> None:
     assert float(last["yaw_deg"]) == pytest.approx(15.0, abs=1.0)
 
 
+@pytest.mark.usefixtures("without_figures")
 @pytest.mark.parametrize("name", ["bluerov2_heavy", "bluerov2-heavy"])
 def test_a_vehicle_has_either_spelling(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
