@@ -104,8 +104,8 @@ def test_follows_a_curved_net_that_moves(name: str) -> None:
     assert follow.n_lost == 0
     assert follow.min_clearance > 0.0
     along = log.column("along")
-    # 0.2 m/s through the water; the current changes what that is over ground.
-    assert along[-1] - along[0] > 5.0 / 60.0 * seconds
+    # 0.2 m/s through the water; in 40 s the current alone carries the vehicles 8.2 and 9.8 m.
+    assert along[-1] - along[0] > 10.2
 
 
 @cache
