@@ -7,19 +7,21 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.planes import Plane, exchanged_plane
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning import assignment
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, Verdict, inflate_for_rival
 from aqualvs.scanning.assignment_kernels import (
+    CELL_LINES,
     FREEDOM,
     INTENSITY_WEIGHT,
     N_MEASURES,
     PER_LASER,
     VARIANCE,
+    judge_planes,
 )
 from aqualvs.scanning.candidates import find_candidates
-from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands, sample_bands
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.stripe import StripePeaks
@@ -146,6 +148,31 @@ def measures(*, light: float, n_lasers: int, freedom: float) -> FloatArray:
     found[[INTENSITY_WEIGHT, PER_LASER]] = light, light / n_lasers
     found[[VARIANCE, FREEDOM]] = 0.08, freedom
     return found
+
+
+def test_a_stripe_that_crosses_a_rival_is_none_of_its_stripes() -> None:
+    """Two upright stripes that cross, each read as the other's, and a level one."""
+    normals = [(-0.96, -0.235, -0.16), (0.96, -0.265, 0.0), (0.0, -0.21, 0.98)]
+    sheets = [Plane(n / np.linalg.norm(n), -0.1285) for n in np.array(normals)]
+    rig = example_rig()
+    lasers = [replace(one, plane=sheet) for one, sheet in zip(rig.lasers, sheets, strict=True)]
+    rig, wall = replace(rig, lasers=tuple(lasers)), Plane.from_normal((0.3, 1.0, 0.0), 0.5)
+    rival = exchanged_plane(wall, *sheets[:2])
+    assert rival is not None
+    bands = plan_bands(rig, rig.camera())
+    triangulator = Triangulator(rig, rig.camera())
+    candidates = find_candidates(peaks_of(rig, [(wall, everywhere)]), bands, triangulator)
+    subsegments, _ = candidates.subsegments()
+    found = np.empty((2, N_MEASURES))
+    judge_planes(
+        np.stack([wall.packed(), rival.packed()]),
+        candidates,
+        subsegments,
+        np.array([one.axis is SearchAxis.ALONG_X for one in bands]),
+        sample_bands(bands, triangulator, CELL_LINES),
+        found,
+    )
+    np.testing.assert_allclose(found[:, INTENSITY_WEIGHT] / found[:, PER_LASER], [3.0, 2.0])
 
 
 def test_a_better_plane_is_tested_in_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:

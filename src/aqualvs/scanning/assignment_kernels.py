@@ -315,9 +315,8 @@ def _copy_plane(plane: FloatArray, out: FloatArray) -> None:
 def _same(one: FloatArray, other: FloatArray, times: float) -> bool:
     """Return whether planes differ by less than `times` the limits of equal hypotheses."""
     cosine = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
-    angle = times * SAME_ANGLE
     near = abs(one[3] - other[3]) < times * SAME_RANGE * other[3]
-    return bool(near and 2.0 * (1.0 - cosine) < angle * angle)
+    return bool(near and 2.0 * (1.0 - cosine) < squared(times * SAME_ANGLE))
 
 
 @inner_kernel
@@ -370,8 +369,7 @@ def judge_planes(
         Written, see `INTENSITY_WEIGHT`.
     """
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
-    seen = np.full(n_bins(candidates.source), -1)
-    near = np.empty(subsegments.laser.shape[0])
+    seen, near = np.full(n_bins(candidates.source), -1), np.empty(subsegments.laser.shape[0])
     lit, expected = np.empty((n_lasers, n_cells), np.bool_), np.empty((n_lasers, n_cells), np.bool_)
     for k in range(planes.shape[0]):
         plane, found = planes[k], measures[k]
@@ -424,7 +422,7 @@ def _intensity_weight_on(
     return total
 
 
-@inner_borrowing_kernel
+@inner_kernel
 def _variance(
     plane: FloatArray, subsegments: Subsegments, near: FloatArray, n_lasers: int
 ) -> tuple[float, float, int]:
@@ -432,20 +430,20 @@ def _variance(
     table, n_lines, laser = subsegments.table, subsegments.n_lines, subsegments.laser
     first_line = subsegments.first_line
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
-    square, n, n_lit = 0.0, 0, 0
-    begin = 0
-    # Least number of search lines of half a stripe.
-    min_lines = 8
+    square, n, most, n_lit = 0.0, 0, 0, 0
+    begin, lit_lines = 0, np.zeros(n_lasers, np.int64)
+    # Least number of search lines of half a stripe, and of a visible laser, as a share of the most:
+    # a stripe of another plane is near this one where it crosses it.
+    min_lines, min_share = 8, 0.15
     for i in range(n_lasers):
-        end = begin
-        middle, lines = 0.0, 0
+        end, middle, lines = begin, 0.0, 0
         while end < laser.shape[0] and laser[end] == i:
             if near[end] > 0.0:
                 middle += n_lines[end] * first_line[end]
                 lines += n_lines[end]
             end += 1
         middle /= max(lines, 1)
-        n_lit += lines >= min_lines
+        lit_lines[i], most = lines, max(most, lines)
         for half in range(2):
             total, lines = 0.0, 0
             for c in range(begin, end):
@@ -458,6 +456,8 @@ def _variance(
                 square += squared(total / lines)
                 n += 1
         begin = end
+    for i in range(n_lasers):
+        n_lit += lit_lines[i] >= max(min_lines, min_share * most)
     freedom = n - 3.0
     if freedom <= 0.0:
         return 1.0, 0.0, n_lit
@@ -475,8 +475,7 @@ def _mark_expected(plane: FloatArray, bands: FloatArray, expected: BoolArray) ->
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     for i in range(bands.shape[0]):
         for cell in range(bands.shape[1]):
-            before = np.nan
-            found = False
+            before, found = np.nan, False
             for s in range(bands.shape[2]):
                 row = bands[i, cell, s]
                 here = x * row[0] + y * row[1] + z * row[2] - offset * row[3]
