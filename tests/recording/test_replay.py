@@ -181,7 +181,7 @@ def test_no_dome_is_mostly_as_for_the_video(whole, demo, tmp_path):
     # than those the recording's stripes were looked for in, so a plane found by few readings may
     # be another.
     both = _valid_in_both(tmp_path / "replay", tmp_path / "video", whole)
-    assert len(both) >= 3
+    assert len(both) >= 2
     off = [abs(found / expected - 1.0) for found, expected, _ in both]
     assert statistics.median(off) < 1e-3
     assert all(abs(found - before) > 1e-4 for found, _, before in both)

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from aqualvs import __version__
 from aqualvs.errors import OutputError
-from aqualvs.recording.encoding import RIG, TOPICS, RecordedTopic
+from aqualvs.recording.encoding import RIG, STRIPES, TOPICS, RecordedTopic
 from aqualvs.recording.growing_file import Chunk, ChunkBuilder, GrowingFile
 from aqualvs.recording.messages import RecordClock, RecorderOptions, SampleEncoder
 from aqualvs.recording.sample import LiveSample
@@ -34,6 +34,7 @@ class SampleChunks:
         self._encoder, self._clock = SampleEncoder(options), RecordClock()
         self._chunk_ns = round(1e9 * options.chunk_s)
         self._sequence = self._publish_ns = 0
+        self._has_frame = False
         self._begin()
 
     def _begin(self) -> None:
@@ -45,17 +46,18 @@ class SampleChunks:
     def add(self, sample: LiveSample) -> bool:
         """Add a sample; return whether the chunk is due.
 
-        The first one is due with the first sample: the rig is in the file from then on, and fits
-        where a disk is nearly full.
+        Until a frame is recorded each sample is a chunk: rig and first frame are in the file at
+        once, and fit where a disk is nearly full.
         """
         stamp_ns = self._clock.stamp_ns(sample)
         self._from_ns = self._from_ns or stamp_ns
         self._publish_ns = max(sample.utc_ns, 0)
+        is_first = not self._has_frame
         self._add(self._encoder.messages(sample, stamp_ns), stamp_ns)
         self._sequence += 1
         self.n_samples += 1
-        long = self._sequence == 1 or stamp_ns - self._from_ns >= self._chunk_ns
-        return long or self._builder.n_bytes >= MAX_CHUNK_BYTES
+        long = stamp_ns - self._from_ns >= self._chunk_ns
+        return is_first or long or self._builder.n_bytes >= MAX_CHUNK_BYTES
 
     def finish(self) -> None:
         """Add the rig again, unless the present chunk contains it already."""
@@ -66,6 +68,7 @@ class SampleChunks:
     def _add(self, messages: Iterable[tuple[RecordedTopic, bytes]], stamp_ns: int) -> None:
         for topic, data in messages:
             self._holds_rig = self._holds_rig or topic is RIG
+            self._has_frame = self._has_frame or topic is STRIPES
             self._builder.add(topic.number, self._sequence, stamp_ns, self._publish_ns, data)
 
     def take(self) -> ChunkBuilder:

@@ -322,7 +322,7 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     # No band: limits beyond any position on a search line.
     anywhere = 1 << 40
     lowest, highest = np.full(n_lines, -anywhere), np.full(n_lines, anywhere)
-    _link(line, position, lowest, highest, 1, segment_of, first, last, count)
+    _link(line, position, lowest, highest, ZERO + 1, segment_of, first, last, count)
     long = np.empty(n, np.bool_)
     for i in range(n):
         long[i] = count[segment_of[i]] >= SUBSEGMENT_LINES
