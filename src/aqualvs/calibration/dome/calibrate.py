@@ -253,6 +253,8 @@ def _cross_validation(found: CrossValidation | None, what: str) -> list[str]:
     )
     if found.dome_is_better:
         return [f"{text}: the {what} model is needed"]
+    if found.n_dome_better > found.n_views // 2:
+        return [f"{text}, but by too little: they do not show that there is a {what}"]
     return [f"{text}: the pictures do not show that there is a {what}"]
 
 
