@@ -19,9 +19,10 @@ def test_a_nominal_file(tmp_path):
     path.write_text(
         "name: blue\nimage: {width: 720, height: 576}\nn_air: 1.0002\nfps: 25\n"
         "dome: {inner_radius_mm: 44.25, thickness_mm: 5.75, n_acrylic: 1.48}\n"
-        "lasers: {count: 3, wavelength_nm: 650}\n"
+        "lasers: {count: 3, wavelength_nm: 650}\nworking_range_mm: [300, 900]\n"
     )
     nominal = load_nominal(path)
+    assert nominal.working_range == (0.3, 0.9)
     assert nominal.wavelength_nm == 650.0
     assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("blue", (720, 576), 3)
     assert nominal.n_air == 1.0002
@@ -59,6 +60,8 @@ def test_a_rig_says_what_its_lasers_agree_on(tmp_path, wavelengths, common):
         ("dome: {inner_radius_mm: -3, thickness_mm: 5}", "dome.inner_radius_mm is -3"),
         ("lasers: {cuont: 3}", "lasers"),
         ("lasers: {count: 3, wavelength_nm: 5320}", "lasers.wavelength_nm is 5320"),
+        ("working_range_mm: [900, 300]", "working_range_mm is [900, 300]"),
+        ("working_range_mm: [0.3, 0.9]", "write [300, 900] if metres are meant"),
         ("just words", "is not a nominal rig"),
     ],
 )

@@ -30,7 +30,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Housing
 from aqualvs.optics.rig import Rig, RigUncertainty, common_wavelength
 from aqualvs.optics.rigfile import housing_of, keep_dated, load_rig, save_rig
-from aqualvs.optics.rigschema import LaserWavelength
+from aqualvs.optics.rigschema import LaserWavelength, range_fault
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR
 from aqualvs.report.calibration_material import (
@@ -115,6 +115,9 @@ class _NominalFile(_Section):
     flat: _Flat | None = None
     n_air: Index = N_AIR
     lasers: _Lasers | None = None
+    working_range_mm: Annotated[list[Positive], Field(min_length=2, max_length=2)] = Field(
+        default=[250.0, 1300.0]
+    )
     fps: Positive | None = None
 
 
@@ -150,6 +153,9 @@ def _from_rig_file(path: Path) -> Nominal:
 
 def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
     file = validated(_NominalFile, dict(content), path, RigError, SchemaWords(file="a nominal rig"))
+    near_mm, far_mm = file.working_range_mm
+    if said := range_fault(near_mm, far_mm):
+        raise RigError(f"{path}: {said}")
     try:
         housing = housing_of(file.dome, file.flat)
     except RigError as fault:
@@ -161,6 +167,7 @@ def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
         n_air=file.n_air,
         n_lasers=None if file.lasers is None else file.lasers.count,
         wavelength_nm=None if file.lasers is None else file.lasers.wavelength_nm,
+        working_range=(1e-3 * near_mm, 1e-3 * far_mm),
     )
 
 

@@ -76,7 +76,9 @@ def camera(
     out: RigOut,
     nominal: Annotated[
         Path | None,
-        typer.Option(help="Nominal values: a rig file, or a file with name, dome and lasers."),
+        typer.Option(
+            help="Nominal values: a rig file, or a file with name, dome, lasers, working range."
+        ),
     ] = None,
     model: Annotated[
         Literal["opencv", "fisheye"], typer.Option(help="Distortion model.")

@@ -360,7 +360,8 @@ def _nominal_mapping(rig: Rig) -> dict[str, Any]:
     lasers: dict[str, Any] = {"count": len(rig.lasers)}
     if (light_nm := common_wavelength(rig.lasers)) is not None:
         lasers["wavelength_nm"] = float(light_nm)
-    return {**content, "n_air": float(rig.n_air), "lasers": lasers}
+    content |= {"n_air": float(rig.n_air), "lasers": lasers}
+    return {**content, "working_range_mm": [targets.to_mm(far) for far in rig.working_range]}
 
 
 def _write_picture(path: Path, image: NDArray[np.uint8], jpeg_quality: int | None) -> None:
