@@ -456,6 +456,30 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     assert refused.reason is Reason.AMBIGUOUS
 
 
+def between_strands(points: FloatArray) -> BoolArray:
+    """What is visible between strands half as far away."""
+    lit: BoolArray = ~strands(0.5 * points)
+    return lit
+
+
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_a_net_before_a_wall_that_its_shadows_break_is_not_overlooked(share: float) -> None:
+    """Unless it is much narrower than the wall, as a fish is."""
+    rig = example_rig()
+    net, wall = Plane.from_normal((0.0, 1.0, 0.0), 0.4), Plane.from_normal((0.0, 1.0, 0.0), 0.8)
+    camera = rig.camera()
+    laser_bands, triangulator = plan_bands(rig, camera), Triangulator(rig, camera)
+    seen = [peaks_of(rig, [one], 0.1) for one in ((net, strands), (wall, between_strands))]
+    candidates = find_candidates(joined(seen), laser_bands, triangulator)
+    subsegments, _ = candidates.subsegments()
+    near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
+    far = replace(far, is_mesh=True, is_unbroken=False, extent=near.extent)
+    near = replace(near, extent=share * near.extent)
+    test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
+    found = test.overlooked(candidates, subsegments, [far, near], far)
+    assert (found is not None) == (share == 1.0)
+
+
 def fish(points: FloatArray) -> BoolArray:
     """Light on a flank of 24 by 8 cm, where two of the stripes cross at 0.75 m."""
     lit: BoolArray = (abs(points[:, 0] - 0.069) < 0.12) & (abs(points[:, 2] - 0.121) < 0.04)

@@ -258,10 +258,11 @@ class AssignmentTest:
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> Surface | None:
-        """Return a surface before something solid that may be a net, if there is one.
+        """Return a surface before the target that may be the net instead, if there is one.
 
         It has light that no other surface explains, all lasers show it, and its stripes are broken;
         a fish shows few lasers and long stripes, and specks on a plane by chance have little light.
+        Of a target that looks like a net itself, it must hide parts.
 
         Parameters
         ----------
@@ -276,12 +277,16 @@ class AssignmentTest:
             `is_mesh` is set if it has the pattern of a net, or if the target alternates with it
             along the stripes; otherwise it may still be a net.
         """
-        if target.is_mesh and not target.is_unbroken:
-            return None
+        # A net's shadows may break a wall's stripes finely. A fan shows nearer meshes as well.
+        broken = target.is_mesh and not target.is_unbroken
         for one in surfaces:
             # Only gappy stripes have an extent, but not where a coarse net shows few strands.
-            may_be_net = one.is_mesh or one.extent > 0.0
+            may_be_net = one.is_mesh or (one.extent > 0.0 and not broken)
             if one is target or not may_be_net or not _is_nearer(one, target, subsegments):
+                continue
+            hides = seen_through(one.members, target.members, subsegments)
+            is_net = hides and not self.fans and one.extent >= _ODDS.min_extent * target.extent
+            if broken and not is_net:
                 continue
             share = self._light_share(candidates, subsegments, surfaces, one)
             # As wide as the target, it may be a net one of whose strands lies along a sheet.
@@ -290,8 +295,7 @@ class AssignmentTest:
             is_uneven = faint > _ODDS.may_be_faint and not (is_wide and share > _ODDS.wide_share)
             if _is_small(one, share, visible) or is_uneven:
                 continue
-            is_mesh = one.is_mesh or seen_through(one.members, target.members, subsegments)
-            return replace(one, is_mesh=is_mesh)
+            return replace(one, is_mesh=one.is_mesh or hides)
         return None
 
     def may_hide_net(
@@ -471,8 +475,7 @@ class AssignmentTest:
 
     def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether too many of the lasers that should show a surface are faint on it."""
-        _, faint, _, _ = self._visibility(surface, subsegments)
-        return faint > _ODDS.may_be_faint
+        return self._visibility(surface, subsegments)[1] > _ODDS.may_be_faint
 
     def _visibility(
         self, surface: Surface, subsegments: Subsegments, *, along_strand: bool = False
@@ -527,8 +530,7 @@ class AssignmentTest:
         n_lasers = len(self._along_x)
         if n_lasers < 2:
             return NOT_TESTED
-        # Number of rivals that are refined.
-        n_rivals = 6
+        n_rivals = 6  # Number of rivals that are refined.
         planes = np.empty((n_rivals + 1, 4))
         measures = np.empty((n_rivals + 1, N_MEASURES))
         planes[0] = surface.plane.packed()
