@@ -167,7 +167,7 @@ def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
         n_air=file.n_air,
         n_lasers=None if file.lasers is None else file.lasers.count,
         wavelength_nm=None if file.lasers is None else file.lasers.wavelength_nm,
-        working_range=(1e-3 * near_mm, 1e-3 * far_mm),
+        working_range=(near_mm / 1e3, far_mm / 1e3),
     )
 
 

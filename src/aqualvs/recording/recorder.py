@@ -46,18 +46,19 @@ class SampleChunks:
     def add(self, sample: LiveSample) -> bool:
         """Add a sample; return whether the chunk is due.
 
-        Until a frame is recorded each sample is a chunk: rig and first frame are in the file at
-        once, and fit where a disk is nearly full.
+        A chunk is due at once with the first frame: that and the rig fit where a disk is nearly
+        full.
         """
         stamp_ns = self._clock.stamp_ns(sample)
         self._from_ns = self._from_ns or stamp_ns
         self._publish_ns = max(sample.utc_ns, 0)
-        is_first = not self._has_frame
+        had_frame = self._has_frame
         self._add(self._encoder.messages(sample, stamp_ns), stamp_ns)
         self._sequence += 1
         self.n_samples += 1
         long = stamp_ns - self._from_ns >= self._chunk_ns
-        return is_first or long or self._builder.n_bytes >= MAX_CHUNK_BYTES
+        is_first_frame = self._has_frame and not had_frame
+        return is_first_frame or long or self._builder.n_bytes >= MAX_CHUNK_BYTES
 
     def finish(self) -> None:
         """Add the rig again, unless the present chunk contains it already."""

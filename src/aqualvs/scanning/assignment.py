@@ -279,14 +279,14 @@ class AssignmentTest:
         """
         # A net's shadows may break a wall's stripes finely. A fan shows nearer meshes as well.
         broken = target.is_mesh and not target.is_unbroken
+        if broken and self.fans:
+            return None
         for one in surfaces:
             # Only gappy stripes have an extent, but not where a coarse net shows few strands.
             may_be_net = one.is_mesh or (one.extent > 0.0 and not broken)
             if one is target or not may_be_net or not _is_nearer(one, target, subsegments):
                 continue
-            hides = seen_through(one.members, target.members, subsegments)
-            is_net = hides and not self.fans and one.extent >= _ODDS.min_extent * target.extent
-            if broken and not is_net:
+            if broken and one.extent < _ODDS.min_extent * target.extent:
                 continue
             share = self._light_share(candidates, subsegments, surfaces, one)
             # As wide as the target, it may be a net one of whose strands lies along a sheet.
@@ -295,7 +295,10 @@ class AssignmentTest:
             is_uneven = faint > _ODDS.may_be_faint and not (is_wide and share > _ODDS.wide_share)
             if _is_small(one, share, visible) or is_uneven:
                 continue
-            return replace(one, is_mesh=one.is_mesh or hides)
+            is_mesh = one.is_mesh and not broken
+            is_mesh = is_mesh or seen_through(one.members, target.members, subsegments)
+            if is_mesh or not broken:
+                return replace(one, is_mesh=is_mesh)
         return None
 
     def may_hide_net(

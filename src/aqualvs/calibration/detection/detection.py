@@ -50,7 +50,7 @@ def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: in
         (agreed_corners(markers, other).n_agreed, remedy) for other, remedy in _other_boards(board)
     ]
     most, remedy = max(counts, key=lambda count: count[0])
-    if agreed_corners(markers, board).n_agreed > most:
+    if agreed_corners(markers, board).n_agreed >= max(_ENOUGH, most + 1):
         return f"{read}, but many are misread; come nearer, or take a sharper picture"
     if most >= _ENOUGH:
         return f"{read}, but not as on this board; {remedy}"
