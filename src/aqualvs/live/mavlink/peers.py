@@ -17,9 +17,8 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from aqualvs.errors import OptionError
 
@@ -63,12 +62,7 @@ def load_key(path: Path) -> bytes:
 class Signer:
     """Signer of what one connection sends; checks the signatures of what it receives.
 
-    Parameters
-    ----------
-    dialect : module
-        pymavlink's messages.
-    key : bytes
-        32 of them.
+    `dialect`: pymavlink's messages. `key`: 32 bytes.
     """
 
     def __init__(self, dialect: Any, key: bytes) -> None:
@@ -134,8 +128,7 @@ _NO_AUTOPILOT = 8
 _MAGIC = (0xFD, 0xFE)
 
 
-@dataclass(frozen=True, slots=True)
-class _Claim:
+class _Claim(NamedTuple):
     """Statement of a heartbeat about the vehicle."""
 
     component: int
@@ -143,33 +136,6 @@ class _Claim:
     autopilot: int
     mode: int
     armed: bool
-
-
-@dataclass(slots=True)
-class _Sender:
-    """An address from which valid messages have come."""
-
-    parser: Any
-    heard_s: float
-
-
-@dataclass(slots=True)
-class _Home:
-    """The address that a system id belongs to, and when it was heard there."""
-
-    peer: Peer
-    heard_s: float
-
-
-@dataclass(slots=True)
-class _Contest:
-    """Recent statements of the vehicle's heartbeats, and the end of their contradiction."""
-
-    now: dict[int, _Claim] = field(default_factory=dict)
-    left_s: dict[_Claim, float] = field(default_factory=dict)
-    rivals: dict[Peer, tuple[_Claim, float]] = field(default_factory=dict)
-    until_s: float = float("-inf")
-    words: str = ""
 
 
 class PeerTable:
@@ -192,42 +158,46 @@ class PeerTable:
         self._errors: tuple[type[Exception], ...] = (*errors, struct.error, IndexError, ValueError)
         # Threads that send ask for addresses while another takes messages in.
         self._lock = threading.Lock()
-        self._senders: dict[Peer, _Sender] = {}
-        self._homes: dict[int, _Home] = {}
-        self._contest = _Contest()
+        # Addresses from which valid messages have come: their parser, and when they were heard.
+        self._senders: dict[Peer, tuple[Any, float]] = {}
+        # The address that each system id belongs to, and when it was heard there.
+        self._homes: dict[int, tuple[Peer, float]] = {}
+        # Recent statements of the vehicle's heartbeats: by component, when one was left, and those
+        # of other addresses.
+        self._claims: dict[int, _Claim] = {}
+        self._left_s: dict[_Claim, float] = {}
+        self._rivals: dict[Peer, tuple[_Claim, float]] = {}
+        self._conflict, self._conflict_until_s = "", float("-inf")
 
     @property
     def vehicle(self) -> Peer | None:
         """Address of the vehicle; None before its first heartbeat."""
         with self._lock:
-            home = self._homes.get(self._system)
-        return None if home is None else home.peer
+            return self._homes.get(self._system, (None, 0.0))[0]
 
     @property
     def conflict(self) -> str:
         """Contradiction between heartbeats of the vehicle; empty if there is none."""
         with self._lock:
-            contest = self._contest
-            return contest.words if time.monotonic() < contest.until_s else ""
+            return self._conflict if time.monotonic() < self._conflict_until_s else ""
 
     @property
     def rival(self) -> str:
         """Other address that speaks as the vehicle; empty if there is none."""
         since_s = time.monotonic() - _CLAIM_LIFETIME_S
+        vehicle = self.vehicle
         with self._lock:
-            rivals = self._contest.rivals
-            found = [peer for peer, (_, at_s) in rivals.items() if at_s > since_s]
-            home = self._homes.get(self._system)
-        if home is None or not found:
+            found = [peer for peer, (_, at_s) in self._rivals.items() if at_s > since_s]
+        if vehicle is None or not found:
             return ""
-        return f"{_shown(home.peer)} and {_shown(found[-1])} both speak as sysid {self._system}"
+        return f"{_shown(vehicle)} and {_shown(found[-1])} both speak as sysid {self._system}"
 
     def receivers(self) -> list[Peer]:
         """Return the addresses that were heard lately: the vehicle's, then the others'."""
         since_s = time.monotonic() - _HEARD_S
         vehicle = self.vehicle
         with self._lock:
-            found = [peer for peer, sender in self._senders.items() if sender.heard_s > since_s]
+            found = [peer for peer, (_, heard_s) in self._senders.items() if heard_s > since_s]
         return sorted(found, key=lambda peer: peer != vehicle)
 
     def restart(self) -> None:
@@ -241,8 +211,8 @@ class PeerTable:
         `whole`: whether it is a datagram: one that begins like a message begins one, and what was
         left of the one before belongs to none.
         """
-        sender = self._senders.get(peer)
-        parser = self._make_parser() if sender is None else sender.parser
+        known = self._senders.get(peer)
+        parser = self._make_parser() if known is None else known[0]
         if whole and data[:1] and data[0] in _MAGIC:
             _reset(parser)
         try:
@@ -264,66 +234,56 @@ class PeerTable:
         system: int = message.get_srcSystem()
         kind = message.get_type()
         with self._lock:
-            if kind == "HEARTBEAT" and self._may_bind(system, message):
+            # Of the vehicle's parts, the autopilot alone says where it is.
+            is_other = system != self._system
+            if kind == "HEARTBEAT" and (is_other or message.autopilot != _NO_AUTOPILOT):
                 self._bind(peer, system, message)
             home = self._homes.get(system)
-        if kind == "MANUAL_CONTROL" and system != self._system:
+        if kind == "MANUAL_CONTROL" and is_other:
             return True
-        if home is None:
-            return system != self._system
-        return home.peer == peer
-
-    def _may_bind(self, system: int, message: Any) -> bool:
-        """Return whether a heartbeat says where a system is; the vehicle's autopilot alone does."""
-        return system != self._system or bool(message.autopilot != _NO_AUTOPILOT)
+        return is_other if home is None else home[0] == peer
 
     def _bind(self, peer: Peer, system: int, message: Any) -> None:
         now_s = time.monotonic()
-        home = self._homes.get(system)
-        if home is None or now_s - home.heard_s > SILENT_AFTER_S:
-            home = self._homes[system] = _Home(peer, now_s)
-        if home.peer == peer:
-            home.heard_s = now_s
+        home, heard_s = self._homes.get(system, (peer, now_s))
+        if home == peer or now_s - heard_s > SILENT_AFTER_S:
+            home, _ = self._homes[system] = peer, now_s
         if system == self._system:
-            self._compare(peer, home.peer, _claim(message), now_s)
+            self._compare(peer, home, _claim(message), now_s)
 
     def _compare(self, peer: Peer, home: Peer, claim: _Claim, now_s: float) -> None:
         """Notice where heartbeats of the vehicle contradict each other."""
-        contest = self._contest
         if peer == home:
-            contest.rivals.pop(peer, None)
-            before = contest.now.get(claim.component)
-            contest.now[claim.component] = claim
+            self._rivals.pop(peer, None)
+            before = self._claims.get(claim.component)
+            self._claims[claim.component] = claim
             if before is not None and before != claim:
                 # A mode that returns so soon was not left: two systems speak from one address.
-                if now_s - contest.left_s.pop(claim, float("-inf")) < _CLAIM_LIFETIME_S:
+                if now_s - self._left_s.pop(claim, float("-inf")) < _CLAIM_LIFETIME_S:
                     self._note_conflict(now_s, f"from {_shown(peer)}")
-                _put_last(contest.left_s, before, now_s)
+                _put_last(self._left_s, before, now_s)
         else:
-            _put_last(contest.rivals, peer, (claim, now_s))
-        for rival, (said, at_s) in contest.rivals.items():
-            ours = contest.now.get(said.component)
+            _put_last(self._rivals, peer, (claim, now_s))
+        for rival, (said, at_s) in self._rivals.items():
+            ours = self._claims.get(said.component)
             if now_s - at_s < _CLAIM_LIFETIME_S and ours is not None and said != ours:
                 self._note_conflict(at_s, f"from {_shown(home)} and {_shown(rival)}")
 
     def _note_conflict(self, at_s: float, where: str) -> None:
-        self._contest.until_s = max(self._contest.until_s, at_s + _CLAIM_LIFETIME_S)
-        self._contest.words = f"heartbeats of sysid {self._system} {where} contradict each other"
+        self._conflict_until_s = max(self._conflict_until_s, at_s + _CLAIM_LIFETIME_S)
+        self._conflict = f"heartbeats of sysid {self._system} {where} contradict each other"
 
     def _remember(self, peer: Peer, parser: Any) -> None:
         """Store the parser of an address, and send to it; strangers never replace known senders."""
         now_s = time.monotonic()
-        sender = self._senders.get(peer)
-        if sender is not None:
-            sender.heard_s = now_s
-            return
         vehicle = self.vehicle
         with self._lock:
-            for other in [p for p, s in self._senders.items() if now_s - s.heard_s > _HEARD_S]:
-                del self._senders[other]
+            for other, (_, heard_s) in list(self._senders.items()):
+                if other != peer and now_s - heard_s > _HEARD_S:
+                    del self._senders[other]
             others = len(self._senders) - (vehicle in self._senders)
-            if peer == vehicle or others < _MAX_OTHERS:
-                self._senders[peer] = _Sender(parser, now_s)
+            if peer in self._senders or peer == vehicle or others < _MAX_OTHERS:
+                self._senders[peer] = parser, now_s
 
 
 def _reset(parser: Any) -> None:
