@@ -41,12 +41,9 @@ class NetAddress:
     # `udpout` sends to the address; `udpin` listens there and answers all known senders; `udpbcast`
     # sends to a broadcast address; `tcp` connects.
     kind: NetKind
-    # Name or number.
-    host: str
-    # 1 to 65535; 0, any free one, for `udpin`.
-    port: int
-    # As the user wrote it.
-    url: str = field(default="", compare=False)
+    host: str  # Name or number.
+    port: int  # 1 to 65535; 0, any free one, for `udpin`.
+    url: str = field(default="", compare=False)  # As the user wrote it.
 
     def __str__(self) -> str:
         """Return the address as messages show it."""
@@ -60,8 +57,7 @@ class SerialAddress:
 
     device: str
     baud: int
-    # As the user wrote it.
-    url: str = field(default="", compare=False)
+    url: str = field(default="", compare=False)  # As the user wrote it.
 
     def __str__(self) -> str:
         """Return the device as messages show it."""
@@ -74,20 +70,14 @@ Address: TypeAlias = NetAddress | SerialAddress
 def parse_address(url: str) -> Address:
     """Read a connection in the forms that pymavlink, MAVProxy and ground stations use.
 
-    Parameters
-    ----------
-    url : str
-        `udpout:HOST:PORT`, `udpin:HOST:PORT`, `udp:HOST:PORT` (the same as `udpin`, as in
-        pymavlink), `udpbcast:HOST:PORT`, `tcp:HOST:PORT`; two slashes after the colon are allowed,
-        and `udpclient`, `udpserver` and `tcpclient`, as BlueOS calls them.
-        An empty host to listen at means every address of this computer.
-        `/dev/ttyACM0`, `/dev/ttyACM0,57600`, `serial:/dev/ttyACM0:57600`, `COM3`, `COM3,57600`,
-        `serial:COM3:57600`; 115200 baud if left out.
+    - `udpout:HOST:PORT`, `udpin:HOST:PORT`, `udp:HOST:PORT` (the same as `udpin`, as in pymavlink),
+      `udpbcast:HOST:PORT`, `tcp:HOST:PORT`; two slashes after the colon are allowed, and
+      `udpclient`, `udpserver` and `tcpclient`, as BlueOS calls them. An empty host to listen at
+      means every address of this computer.
+    - `/dev/ttyACM0`, `/dev/ttyACM0,57600`, `serial:/dev/ttyACM0:57600`, `COM3`, `COM3,57600`,
+      `serial:COM3:57600`; 115200 baud if left out.
 
-    Raises
-    ------
-    OptionError
-        If it is none of these.
+    Raises `OptionError` if it is none of these.
     """
     scheme, colon, rest = url.partition(":")
     kind = _NET_KINDS.get(scheme.lower()) if colon else None
@@ -149,8 +139,7 @@ def _net_address(kind: NetKind, rest: str, url: str) -> NetAddress:
             f"MAVLink connection {url!r}: no HOST:PORT after the scheme; {_FORMS}; {PORTS}"
         )
     host, port = found
-    listens = kind == "udpin"
-    if not listens and (not host or not port):
+    if kind != "udpin" and not all(found):
         raise OptionError(f"MAVLink connection {url!r}: whom to send to is missing; {_FORMS}")
     return NetAddress(kind, host or "0.0.0.0", port, url)
 
@@ -227,30 +216,17 @@ def open_port(address: Address) -> Port:
         return SerialPort(address)
     if address.kind == "tcp":
         return _TcpPort(address)
-    if address.kind == "udpbcast":
-        return _UdpBroadcaster(address)
-    return _UdpListener(address) if address.kind == "udpin" else _UdpSender(address)
+    flags = socket.AI_PASSIVE if address.kind == "udpin" else 0
+    kinds = {"udpout": UdpPort, "udpbcast": _UdpBroadcaster, "udpin": _UdpListener}
+    return kinds[address.kind](address, *find_host(address.host, address.port, flags))
 
 
 def check_address(address: Address) -> None:
-    """Raise if this computer can never open such an address.
+    """Raise `OptionError` for a serial port without pyserial, or of a speed unknown to it."""
+    if isinstance(address, SerialAddress):
+        from aqualvs.live.mavlink.serial import check_speed
 
-    Raises `OptionError` for a serial port without pyserial, or at a speed that it does not know.
-    """
-    if not isinstance(address, SerialAddress):
-        return
-    from aqualvs.live.mavlink.serial import check_speed
-
-    check_speed(address)
-
-
-def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tuple[object, ...]]:
-    """Return a socket that never waits, and the address as the system writes it."""
-    flags = socket.AI_PASSIVE if passive else 0
-    family, where = find_host(address.host, address.port, flags)
-    made = socket.socket(family, socket.SOCK_DGRAM)
-    made.setblocking(False)
-    return made, where
+        check_speed(address)
 
 
 def find_host(host: str, port: int, flags: int) -> tuple[int, tuple[object, ...]]:
@@ -265,12 +241,27 @@ def find_host(host: str, port: int, flags: int) -> tuple[int, tuple[object, ...]
 
 
 class UdpPort(Port):
-    """Common base of UDP ports: a datagram goes at once or not at all."""
+    """Port to one address, which hears only that; a datagram goes at once or not at all.
+
+    `family`, `where`: from `find_host`.
+    """
 
     whole = True
 
-    def __init__(self, made: socket.socket, where: Peer = ()) -> None:
-        self._socket, self._where = made, where
+    def __init__(self, address: NetAddress, family: int, where: Peer) -> None:
+        self._address = address
+        self._where: Peer = ()  # Where all goes; empty where the socket knows.
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._prepare(where)
+        except OSError:
+            self._socket.close()
+            raise
+
+    def _prepare(self, where: Peer) -> None:
+        # Connected, so that the system reports a closed port and filters other senders.
+        self._socket.connect(where)
 
     def fileno(self) -> int:
         """Return the number of the socket."""
@@ -284,7 +275,8 @@ class UdpPort(Port):
         """Return a datagram and its sender; empty if none has come."""
         datagram = 65_535
         try:
-            return self._socket.recvfrom(datagram)
+            data, peer = self._socket.recvfrom(datagram)
+            return data, peer if self.many else ()
         except (ConnectionRefusedError, ConnectionResetError):
             self.refused_s = time.monotonic()
         except OSError as fault:
@@ -316,38 +308,16 @@ class UdpPort(Port):
         return False
 
 
-class _UdpSender(UdpPort):
-    """Port that sends to one address and hears only that."""
-
-    def __init__(self, address: NetAddress) -> None:
-        made, where = _open_udp(address, passive=False)
-        super().__init__(made)
-        try:
-            # Connected, so that the system reports a closed port and filters other senders.
-            made.connect(where)
-        except OSError:
-            made.close()
-            raise
-
-    def read(self) -> tuple[bytes, Peer]:
-        return super().read()[0], ()
-
-
 class _UdpBroadcaster(UdpPort):
     """Port that sends to a broadcast address and hears all that answer."""
 
     many = True
 
-    def __init__(self, address: NetAddress) -> None:
-        made, where = _open_udp(address, passive=False)
-        super().__init__(made, where)
-        try:
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            # Bound, so that it can be read before the first datagram goes out.
-            made.bind(("", 0))
-        except OSError:
-            made.close()
-            raise
+    def _prepare(self, where: Peer) -> None:
+        self._where = where
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        # Bound, so that it can be read before the first datagram goes out.
+        self._socket.bind(("", 0))
 
 
 class _UdpListener(UdpPort):
@@ -355,19 +325,17 @@ class _UdpListener(UdpPort):
 
     many = True
 
-    def __init__(self, address: NetAddress) -> None:
-        made, where = _open_udp(address, passive=True)
-        super().__init__(made)
+    def _prepare(self, where: Peer) -> None:
         try:
-            made.bind(where)
+            self._socket.bind(where)
         except OSError as fault:
-            made.close()
-            if fault.errno == errno.EADDRNOTAVAIL:
-                raise OSError(
-                    fault.errno,
-                    f"{address.host} is not an address of this computer; to send there use udpout:",
-                ) from fault
-            raise
+            if fault.errno != errno.EADDRNOTAVAIL:
+                raise
+            raise OSError(
+                fault.errno,
+                f"{self._address.host} is not an address of this computer; "
+                "to send there use udpout:",
+            ) from fault
 
     def write(self, frames: bytes, peer: Peer, /) -> bool:
         """Send to one peer; one that cannot be reached must not keep it from the others."""

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.live.mavlink.ports import parse_host_port
+from aqualvs.live.mavlink.ports import parse_host_port, why
 from aqualvs.live.outputs.base import Output
 from aqualvs.recording.rerun_log import RRD, RerunLog, rerun_sdk
 from aqualvs.recording.sample import LiveSample
@@ -112,7 +112,7 @@ class RerunOutput(Output):
         try:
             socket.create_connection(address, _REACH_S).close()
         except OSError as fault:
-            raise OSError(f"no viewer at {self._where} ({fault.strerror or fault})") from fault
+            raise OSError(f"no viewer at {self._where} ({why(fault)})") from fault
 
 
 def _file_log(path: Path) -> RerunLog:
@@ -122,8 +122,7 @@ def _file_log(path: Path) -> RerunLog:
     try:
         log.save(path)
     except (OSError, ValueError) as fault:
-        words = fault.strerror if isinstance(fault, OSError) else fault
         raise OutputError(
-            f"--rerun {path}: cannot be written ({words}); choose another place"
+            f"--rerun {path}: cannot be written ({why(fault)}); choose another place"
         ) from fault
     return log

@@ -11,7 +11,8 @@ from typing import TypeAlias
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.mavlink.ports import PORTS, NetAddress, UdpPort, find_host, parse_host_port
+from aqualvs.live.mavlink.peers import Peer
+from aqualvs.live.mavlink.ports import PORTS, NetAddress, UdpPort, find_host, parse_host_port, why
 from aqualvs.live.outputs.base import Output
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.folder import POSTURE_COLUMNS, posture_cells
@@ -172,6 +173,12 @@ def receiver_address(text: str) -> NetAddress:
     return NetAddress("udpout", *found, text)
 
 
+class _BroadcastingPort(UdpPort):
+    def _prepare(self, where: Peer) -> None:
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        super()._prepare(where)
+
+
 class _Receiver:
     """One address, found once and then sent to by a socket that never waits."""
 
@@ -201,7 +208,7 @@ class _Receiver:
             port = self._opened()
             sent = port is not None and port.write(line, ())
         except OSError as fault:
-            self._fault = fault.strerror or str(fault)
+            self._fault = why(fault)
             self._drop_port()
             sent = False
         if sent:
@@ -219,13 +226,7 @@ class _Receiver:
         due = now - self._opened_s >= reopen_every_s
         if self._port is None and self._where is not None and due:
             self._opened_s = now
-            family, where = self._where
-            made = socket.socket(family, socket.SOCK_DGRAM)
-            self._port = UdpPort(made)
-            made.setblocking(False)
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            # Connected, so that the system reports a closed port.
-            made.connect(where)
+            self._port = _BroadcastingPort(self._address, *self._where)
         return self._port
 
     def _drop_port(self) -> None:
@@ -240,12 +241,12 @@ class _Receiver:
             if self._where is None:
                 self._closing.wait(resolve_every_s)
 
-    def _lookup(self, flags: int) -> tuple[int, tuple[object, ...]] | None:
+    def _lookup(self, flags: int) -> tuple[int, Peer] | None:
         """Return family and address of the host, IPv4 first; None if it is not known."""
         try:
             found = find_host(self._address.host, self._address.port, flags)
         except (OSError, UnicodeError) as fault:
-            self._fault = (fault.strerror if isinstance(fault, OSError) else "") or str(fault)
+            self._fault = why(fault)
             return None
         self._fault = ""
         return found
