@@ -17,7 +17,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions, gyro_rates_of
 from aqualvs.live.mavlink.ardusub_commands import Command
-from aqualvs.live.mavlink.link import Received
+from aqualvs.live.mavlink.link import Received, packed
 from aqualvs.simulation.dive import vehicle_attitude
 from aqualvs.simulation.scenario import dome_from_target
 
@@ -52,12 +52,14 @@ class Wire:
     def make_packer(self, system: int, component: int) -> Any:
         return dialect.MAVLink(None, system, component)
 
-    def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
+    def send(
+        self, *messages: Any, urgent: bool = False, to_vehicle: bool = False, packer: Any = None
+    ) -> bool:
         assert urgent
         assert to_vehicle
         reader = dialect.MAVLink(None)
         for message in messages if self.works else ():
-            self.sent.extend(reader.parse_buffer(message.pack(self.packer)))
+            self.sent.extend(reader.parse_buffer(packed(message, packer or self.packer)))
         return self.works
 
     def health(self) -> Any:

@@ -31,8 +31,11 @@ from aqualvs.control.sticks import FULL, MIDDLE, PARAMETERS, Sticks, shaping_of
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
 from aqualvs.errors import OptionError, check_positive
 from aqualvs.live.mavlink.ardusub_commands import (
+    CENTRE_US,
+    MAX_US,
+    MIN_US,
+    STICK_CHANNELS,
     Command,
-    Commander,
     GuidedCommander,
     StickCommander,
     StickResponse,
@@ -56,21 +59,15 @@ FRESH_S = 1.0
 
 _INVALID = 32767
 # ArduSub turns full deflection at a pilot gain of 1 into 400 us about 1500 us (joystick.cpp).
-_CENTRE_US, _FULL_US = 1500, 400
-_MIN_US, _MAX_US = 800, 2200
-_YAW, _FORWARD, _LATERAL, _VERTICAL = "chan4_raw", "chan5_raw", "chan6_raw", "chan3_raw"
+_FULL_US = 400
 _KEPT = 200
 
 
 class PilotSticks:
     """Detector of movements of the pilot's sticks.
 
-    Parameters
-    ----------
-    own : (int, int)
-        System and component in whose name we send sticks ourselves.
-    dead_band : float
-        Deflection, as a share of the full one, that counts as centred.
+    `own`: system and component in whose name we send sticks ourselves. `dead_band`: deflection, as
+    a share of the full one, that counts as centred.
     """
 
     def __init__(self, link: MavlinkLink, *, own: tuple[int, int], dead_band: float) -> None:
@@ -104,19 +101,19 @@ class PilotSticks:
         # The thread that sends may add while this one reads.
         ours = [s for at, s in self._sent.copy() if since <= at <= found.received_ns]
         message = found.message
-        for channel, axis in ((_FORWARD, "x"), (_LATERAL, "y"), (_YAW, "r")):
+        for channel, axis in STICK_CHANNELS:
             if self._exceeds(message, channel, [getattr(sticks, axis) for sticks in ours]):
                 return True
         # JS_THR_GAIN scales the vertical by up to 4: while we use that axis, it shows nothing.
         vertical_is_ours = any(s.z != MIDDLE for s in ours)
-        return not vertical_is_ours and self._exceeds(message, _VERTICAL, [])
+        return not vertical_is_ours and self._exceeds(message, "chan3_raw", [])
 
     def _exceeds(self, message: Any, channel: str, ours: list[int]) -> bool:
         """Return whether a channel is outside of the range that our own sticks explain."""
         pulse_us = getattr(message, channel)
-        if not _MIN_US <= pulse_us <= _MAX_US:
+        if not MIN_US <= pulse_us <= MAX_US:
             return False
-        swing = (pulse_us - _CENTRE_US) / _FULL_US
+        swing = (pulse_us - CENTRE_US) / _FULL_US
         least, most = min((0, *ours)) / FULL, max((0, *ours)) / FULL
         return not least - self._dead_band <= swing <= most + self._dead_band
 
@@ -173,11 +170,16 @@ _log = logging.getLogger(__name__)
 
 def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | None]:
     """Return an autopilot's roll, pitch and heading (in [0, 2 pi)), in radians; None if unknown."""
-    found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
-    if found is None or found.age_s > FRESH_S:
+    found = _fresh_attitude(link)
+    if found is None:
         return None, None, None
     message = found.message
     return message.roll, message.pitch, message.yaw % (2.0 * math.pi)
+
+
+def _fresh_attitude(link: MavlinkLink) -> Received | None:
+    found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
+    return None if found is None or found.age_s > FRESH_S else found
 
 
 def gyro_rates_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
@@ -185,8 +187,8 @@ def gyro_rates_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
 
     `at_ns`: time of a picture, by `time.monotonic_ns`.
     """
-    found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
-    if found is None or found.age_s > FRESH_S:
+    found = _fresh_attitude(link)
+    if found is None:
         return None
     message = found.message
     # Forward, right, down to the dome's right, forward, up.
@@ -256,17 +258,9 @@ class ArduSubOptions:
 class ArduSubLink:
     """A vehicle with ArduSub, as `aqualvs.control.vehicle.VehicleLink`.
 
-    Parameters
-    ----------
-    link : str or MavlinkLink
-        Address as in `parse_address`, or a link that others use too; such a one is not closed here.
-    advises : bool
-        Whether settings of the vehicle that are not safe are logged.
-
-    Raises
-    ------
-    OptionError
-        If the address makes no sense, or pymavlink is not installed.
+    `link`: address as in `parse_address`, or a link that others use too, which is not closed here.
+    `advises`: whether settings of the vehicle that are not safe are logged. Raises `OptionError` if
+    the address makes no sense, or pymavlink is not installed.
     """
 
     def __init__(
@@ -283,7 +277,13 @@ class ArduSubLink:
         # Not a ground station's own component (190 as a rule): a router would take the two for one,
         # and keep its messages from us.
         self._sender = (self.options.ground_station, MAV_COMP_ID_ONBOARD_COMPUTER)
-        self._commander = self._make_commander()
+        self._commander: StickCommander | GuidedCommander = (
+            StickCommander(self.link, self._sender)
+            if self.options.command is Command.STICKS
+            else GuidedCommander(
+                self.link, speed=self.options.speed, turning_rate=self.options.turning_rate
+            )
+        )
         dead_band = self.options.stick_dead_band
         self._sticks = PilotSticks(self.link, own=self._sender, dead_band=dead_band)
         self._depth = DepthChoice(self.link)
@@ -354,25 +354,14 @@ class ArduSubLink:
         if self._owns_link:
             self.link.close()
 
-    def _make_commander(self) -> Commander:
-        options, link = self.options, self.link
-        if options.command is Command.GUIDED:
-            return GuidedCommander(
-                link.dialect,
-                target=link.system,
-                speed=options.speed,
-                turning_rate=options.turning_rate,
-            )
-        return StickCommander(link.dialect, link.make_packer(*self._sender), target=link.system)
-
     def _send(self, effort: Effort) -> bool:
         with self._sending:
             if isinstance(self._commander, StickCommander):
                 sticks = self._commander.sticks(effort)
                 self._sticks.note(sticks)
                 self._response.note(sticks)
-            message = self._commander.message(effort)
-            sent = self.link.send(message, urgent=True, to_vehicle=True)
+            message, packer = self._commander.message(effort), self._commander.packer
+            sent = self.link.send(message, urgent=True, to_vehicle=True, packer=packer)
             self._sent_s = time.monotonic() if sent else self._sent_s
         return sent
 
@@ -392,9 +381,8 @@ class ArduSubLink:
         """Log advice on the vehicle's settings once, when they are known or stay unanswered."""
         if self._advised or self.options.command is not Command.STICKS:
             return
-        if not (StationRange(parameters).known or self._watch.has_waited):
-            return
-        if PILOT_TIMEOUT not in parameters and not self._watch.has_waited:
+        is_known = StationRange(parameters).known and PILOT_TIMEOUT in parameters
+        if not is_known and not self._watch.has_waited:
             return
         self._advised = True
         advice = advise_on_station(parameters, self.options.ground_station)

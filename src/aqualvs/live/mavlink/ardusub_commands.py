@@ -10,7 +10,7 @@ import math
 import time
 from collections import deque
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any
 
 from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping
 from aqualvs.control.vehicle import Effort, clipped
@@ -23,8 +23,10 @@ _WINDOW_S, _MIN_PAIRS = 6.0, 18
 # full stick does not respond to it.
 _TURNING_STICK, _MIN_TURN = 0.5, math.radians(2.0)
 _LONGEST_STICK_S = 0.3
-_CENTRE_US, _MIN_US, _MAX_US = 1500, 800, 2200
-_AXES = (("chan5_raw", "x"), ("chan6_raw", "y"), ("chan4_raw", "r"))
+CENTRE_US, MIN_US, MAX_US = 1500, 800, 2200
+"""Pulses of a centred channel, and the least and greatest of one that is in use."""
+STICK_CHANNELS = (("chan5_raw", "x"), ("chan6_raw", "y"), ("chan4_raw", "r"))
+"""Fields of `RC_CHANNELS` and the axes of `Sticks` that move them; the vertical is apart."""
 
 
 class StickResponse:
@@ -35,7 +37,7 @@ class StickResponse:
         self._stick: tuple[float, Sticks] | None = None
         self._began_s = math.inf
         self._seen_ns = {"RC_CHANNELS": 0, "ATTITUDE": 0}
-        self._channels = {channel: _Pairs() for channel, _ in _AXES}
+        self._channels = {channel: _Pairs() for channel, _ in STICK_CHANNELS}
         self._turns = _Pairs()
 
     def note(self, sticks: Sticks) -> None:
@@ -73,10 +75,10 @@ class StickResponse:
         """Pair the messages since the last call with our stick."""
         message = self._new_message("RC_CHANNELS")
         if message is not None:
-            for channel, axis in _AXES:
+            for channel, axis in STICK_CHANNELS:
                 share, pulse_us = getattr(sticks, axis) / FULL, getattr(message, channel)
                 # 0 and 65535 mean an unused channel.
-                off_us = pulse_us - _CENTRE_US if _MIN_US < pulse_us < _MAX_US else 0
+                off_us = pulse_us - CENTRE_US if MIN_US < pulse_us < MAX_US else 0
                 self._channels[channel].add(now_s, share, float(off_us))
         message = self._new_message("ATTITUDE")
         turn = sticks.r / FULL
@@ -138,108 +140,62 @@ class Command(StrEnum):
     estimate."""
 
 
-class Packable(Protocol):
-    """A message as `MavlinkLink.send` takes it."""
-
-    def pack(self, packer: Any, /) -> bytes:
-        """Return the frame."""
-
-
-class Commander(Protocol):
-    """Interface of a converter from efforts to messages."""
-
-    def message(self, effort: Effort) -> Packable:
-        """Return the message for an effort of finite parts."""
-
-
 class StickCommander:
     """Converter to `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
 
-    Parameters
-    ----------
-    dialect : module
-        pymavlink's messages.
-    packer : object
-        Of the sender, see `MavlinkLink.make_packer`; its system id must be the vehicle's
-        MAV_GCS_SYSID (SYSID_MYGCS), its component must not be the ground station's own, or a router
-        would take the two for one.
-    target : int
-        System id of the vehicle.
+    `sender`: system and component. The system must be the vehicle's MAV_GCS_SYSID (SYSID_MYGCS),
+    the component not the ground station's own, or a router would take the two for one.
     """
 
-    def __init__(self, dialect: Any, packer: Any, *, target: int) -> None:
+    def __init__(self, link: MavlinkLink, sender: tuple[int, int]) -> None:
         # How the vehicle converts sticks; ArduSub's default until it has reported its own.
         self.shaping = StickShaping()
         self.keeps_place = False  # Whether its mode is POSHOLD.
-        self._message = dialect.MAVLink_manual_control_message(target, 0, 0, MIDDLE, 0, 0)
-        self._packer = packer
+        self.packer = link.make_packer(*sender)
+        kind = link.dialect.MAVLink_manual_control_message
+        self._message = kind(link.system, 0, 0, MIDDLE, 0, 0)
 
     def sticks(self, effort: Effort) -> Sticks:
         """Return the stick positions for an effort of finite parts."""
         return self.shaping.sticks(effort, keeps_place=self.keeps_place)
 
-    def message(self, effort: Effort) -> Packable:
-        """Return the message; no button is ever pressed."""
+    def message(self, effort: Effort) -> Any:
+        """Return the message for an effort of finite parts; no button is ever pressed."""
         sticks, message = self.sticks(effort), self._message
         message.x, message.y, message.z, message.r = sticks.x, sticks.y, sticks.z, sticks.r
-        return _OnBehalf(message, self._packer)
+        return message
 
 
 class GuidedCommander:
     """Converter to speeds in the body's axes, for a vehicle that knows its position.
 
-    Parameters
-    ----------
-    dialect : module
-        pymavlink's messages.
-    target : int
-        System id of the vehicle.
-    speed : float
-        What an effort of 1 forward, right or down asks for, in m/s.
-    turning_rate : float
-        What an effort of 1 in yaw asks for, in rad/s.
+    `speed`, `turning_rate`: what an effort of 1 asks for, in m/s and rad/s.
     """
 
-    def __init__(self, dialect: Any, *, target: int, speed: float, turning_rate: float) -> None:
+    packer = None  # The link's own: ArduSub obeys any sender.
+
+    def __init__(self, link: MavlinkLink, *, speed: float, turning_rate: float) -> None:
         self._speed, self._turning_rate = speed, turning_rate
+        dialect = link.dialect
         ignored = (
-            "POSITION_TARGET_TYPEMASK_X_IGNORE",
-            "POSITION_TARGET_TYPEMASK_Y_IGNORE",
-            "POSITION_TARGET_TYPEMASK_Z_IGNORE",
-            "POSITION_TARGET_TYPEMASK_AX_IGNORE",
-            "POSITION_TARGET_TYPEMASK_AY_IGNORE",
-            "POSITION_TARGET_TYPEMASK_AZ_IGNORE",
-            "POSITION_TARGET_TYPEMASK_YAW_IGNORE",
+            getattr(dialect, f"POSITION_TARGET_TYPEMASK_{axis}_IGNORE")
+            for axis in ("X", "Y", "Z", "AX", "AY", "AZ", "YAW")
         )
         self._message = dialect.MAVLink_set_position_target_local_ned_message(
             0,
-            target,
+            link.system,
             dialect.MAV_COMP_ID_AUTOPILOT1,
             dialect.MAV_FRAME_BODY_NED,
-            sum(getattr(dialect, name) for name in ignored),
+            sum(ignored),
             *(0.0,) * 11,
         )
 
-    def message(self, effort: Effort) -> Packable:
-        """Return the message."""
+    def message(self, effort: Effort) -> Any:
+        """Return the message for an effort of finite parts."""
         message = self._message
         message.time_boot_ms = (time.monotonic_ns() // 1_000_000) & 0xFFFF_FFFF
         message.vx = self._speed * clipped(effort.forward)
         message.vy = self._speed * clipped(effort.right)
         message.vz = self._speed * clipped(effort.down)
         message.yaw_rate = self._turning_rate * clipped(effort.yaw)
-        packable: Packable = message
-        return packable
-
-
-class _OnBehalf:
-    """A message that is packed in another sender's name than the link's."""
-
-    def __init__(self, message: Any, packer: Any) -> None:
-        self._message, self._packer = message, packer
-
-    def pack(self, _packer: Any, /) -> bytes:
-        max_seq = 256
-        frame: bytes = self._message.pack(self._packer)
-        self._packer.seq = (self._packer.seq + 1) % max_seq
-        return frame
+        return message

@@ -91,15 +91,8 @@ class MavlinkLink:
     A system id belongs to the address where it was heard first, until it has been silent there for
     five seconds; what others send in its name is left out (see `PeerTable`).
 
-    Parameters
-    ----------
-    address : Address or str
-        From `parse_address`, or as it takes it.
-
-    Raises
-    ------
-    OptionError
-        If the address makes no sense, or pymavlink is not installed.
+    `address`: from `parse_address`, or as it takes it. Raises `OptionError` if the address makes no
+    sense, or pymavlink is not installed.
     """
 
     def __init__(self, address: Address | str, options: LinkOptions | None = None) -> None:
@@ -144,7 +137,9 @@ class MavlinkLink:
             self._signer.sign(packer)
         return packer
 
-    def send(self, *messages: Any, urgent: bool = False, to_vehicle: bool = False) -> bool:
+    def send(
+        self, *messages: Any, urgent: bool = False, to_vehicle: bool = False, packer: Any = None
+    ) -> bool:
         """Send messages together, in one datagram where there are datagrams; never waits.
 
         Parameters
@@ -155,6 +150,8 @@ class MavlinkLink:
             On a serial line, may be delayed a little where others are dropped.
         to_vehicle : bool
             To the vehicle alone, also where others are heard.
+        packer : object, optional
+            From `make_packer`, to send in another name than the own.
 
         Returns
         -------
@@ -168,7 +165,7 @@ class MavlinkLink:
         """
         timeout_s = _URGENT_TIMEOUT_S if urgent else _TIMEOUT_S
         with self._sending:
-            sent = self._send(messages, timeout_s, to_vehicle=to_vehicle)
+            sent = self._send(messages, timeout_s, to_vehicle, packer or self._packer)
             self._n_unsent += not sent
         return sent
 
@@ -179,12 +176,11 @@ class MavlinkLink:
 
         `system`, `component`: only from these; from any if None.
         """
-        found = [
+        return _newest(
             entry
             for entry in self.every(kind)
             if system in (None, entry.system) and component in (None, entry.component)
-        ]
-        return max(found, key=lambda entry: entry.received_ns, default=None)
+        )
 
     def every(self, kind: str) -> list[Received]:
         """Return the last message of a kind of each sender."""
@@ -204,18 +200,8 @@ class MavlinkLink:
     def read_parameters(self, names: Iterable[str], *, timeout_s: float = 3.0) -> dict[str, float]:
         """Ask the autopilot for parameters and wait for the answers.
 
-        Parameters
-        ----------
-        names : iterable of str
-            As ArduPilot calls them, such as `RC4_DZ`.
-        timeout_s : float
-            How long to ask and wait, in seconds.
-
-        Returns
-        -------
-        parameters : dict of str to float
-            In the autopilot's units. A parameter that the autopilot does not have, or did not
-            answer in time, is left out.
+        `names`: as ArduPilot calls them, such as `RC4_DZ`. The result is in the autopilot's units;
+        parameters that it does not have, or did not answer in time, are left out.
         """
         wanted = list(dict.fromkeys(names))
         with self._receiving:
@@ -254,8 +240,7 @@ class MavlinkLink:
 
     def autopilot(self) -> Received | None:
         """Return the last heartbeat of the own vehicle's autopilot, None if none has come."""
-        beats = [beat for beat in self._autopilots() if beat.system == self.system]
-        return max(beats, key=lambda beat: beat.received_ns, default=None)
+        return _newest(beat for beat in self._autopilots() if beat.system == self.system)
 
     def health(self) -> PartHealth:
         """Return how the connection is."""
@@ -283,8 +268,7 @@ class MavlinkLink:
             return State.WARN, self._waiting_for()
         if age_s > SILENT_AFTER_S:
             return State.WARN, f"no heartbeat for {age_s:.0f} s"
-        doubt = self._peers.conflict or self._peers.rival
-        if doubt:
+        if doubt := self._peers.conflict or self._peers.rival:
             return State.WARN, doubt
         return State.OK, f"autopilot {_name(beat)} seen {age_s:.1f} s ago"
 
@@ -303,7 +287,9 @@ class MavlinkLink:
         beats = self.every("HEARTBEAT")
         return [beat for beat in beats if beat.message.autopilot != _NO_AUTOPILOT]
 
-    def _send(self, messages: tuple[Any, ...], timeout_s: float, *, to_vehicle: bool) -> bool:
+    def _send(
+        self, messages: tuple[Any, ...], timeout_s: float, to_vehicle: bool, packer: Any
+    ) -> bool:
         port = self._port
         if port is None or self._broken is not None:
             return False
@@ -313,18 +299,13 @@ class MavlinkLink:
                 return False
             if self._signer is not None:
                 self._signer.advance()
-            frames = b"".join([self._packed(message) for message in messages])
+            frames = b"".join([packed(message, packer) for message in messages])
             if to_vehicle and vehicle is not None:
                 return port.write(frames, vehicle)
             return port.write_all(frames, self._peers.receivers())
         except OSError as fault:
             self._broken = fault
             return False
-
-    def _packed(self, message: Any) -> bytes:
-        frame: bytes = message.pack(self._packer)
-        self._packer.seq = (self._packer.seq + 1) % 256
-        return frame
 
     def _run(self) -> None:
         # After a connection that lasted this long, the next attempt follows quickly again.
@@ -363,7 +344,7 @@ class MavlinkLink:
             if now_s >= beat_s:
                 beat_s = now_s + HEARTBEAT_EVERY_S
                 with self._sending:
-                    self._send((self._heartbeat,), _URGENT_TIMEOUT_S, to_vehicle=False)
+                    self._send((self._heartbeat,), _URGENT_TIMEOUT_S, False, self._packer)
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if port.unsent else 0)
             selector.modify(port, events)
             for _, ready in selector.select(min(_LOOK_EVERY_S, max(0.0, beat_s - now_s))):
@@ -380,10 +361,8 @@ class MavlinkLink:
 
     def _check_silence(self, opened_s: float) -> None:
         """Raise if the peer was heard once and has been silent long, to look it up anew."""
-        beat = self.autopilot()
-        if beat is None or isinstance(self._address, SerialAddress):
-            return
-        if self._address.kind == "udpin":
+        beat, address = self.autopilot(), self._address
+        if beat is None or isinstance(address, SerialAddress) or address.kind == "udpin":
             return
         if min(beat.age_s, time.monotonic() - opened_s) > _REOPEN_AFTER_S:
             raise TimeoutError(0, f"no heartbeat for {beat.age_s:.0f} s")
@@ -426,6 +405,17 @@ class MavlinkLink:
             if kind == "PARAM_VALUE" and sender == self._autopilot_ids:
                 # ArduPilot casts integers to float; it does not copy their bits.
                 self._parameters[message.param_id] = float(message.param_value)
+
+
+def _newest(entries: Iterable[Received]) -> Received | None:
+    return max(entries, key=lambda entry: entry.received_ns, default=None)
+
+
+def packed(message: Any, packer: Any) -> bytes:
+    """Return the frame of a message, numbered by its packer."""
+    frame: bytes = message.pack(packer)
+    packer.seq = (packer.seq + 1) % 256
+    return frame
 
 
 def _check_id(name: str, value: int) -> None:
