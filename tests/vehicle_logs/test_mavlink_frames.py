@@ -106,11 +106,6 @@ def test_a_telemetry_log_is_read(tmp_path: Path, how: dict[str, object]) -> None
     np.testing.assert_allclose(state.heading, [0.0, 0.1275, 0.4925], atol=1e-6)
     np.testing.assert_allclose(state.roll, 0.1, atol=1e-6)
     np.testing.assert_allclose(state.pitch, -0.05, atol=1e-6)
-    assert log.velocity_ned is not None
-    np.testing.assert_allclose(log.velocity_ned.values[0], [0.1, -0.2, 0.3])
-    assert log.armed is not None
-    assert log.armed.values.tolist() == [0.0] * 3 + [1.0] * 7
-    assert [mode for _, mode in log.modes] == ["MANUAL", "ALT_HOLD"]
     assert log.start_utc_s == pytest.approx(START_US / 1e6 + 0.02, abs=1e-3)
 
 
@@ -177,7 +172,7 @@ def test_a_restart_of_the_autopilot_keeps_one_clock(tmp_path: Path) -> None:
     assert log.heading is not None
     # Both runs' fastest messages are 20 ms late.
     assert log.heading.time_s[100] == pytest.approx(20.0, abs=1e-3)
-    assert log.heading.n_gaps == 1
+    assert np.count_nonzero(np.diff(log.heading.time_s) > log.heading.max_gap_s) == 1
 
 
 def test_a_step_of_the_computers_clock_is_told_and_does_not_matter(tmp_path: Path) -> None:
@@ -311,11 +306,6 @@ def test_a_dataflash_log_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.rad2deg(state.heading), [359.0, 9.0, 18.7], atol=1e-9)
     np.testing.assert_allclose(np.rad2deg(state.roll), -1.5)
     np.testing.assert_allclose(np.rad2deg(state.pitch), 2.5)
-    assert log.velocity_ned is not None
-    np.testing.assert_allclose(log.velocity_ned.values, [[0.1, 0.2, 0.3]] * 100, atol=1e-6)
-    assert log.armed is not None
-    np.testing.assert_allclose(log.armed.at([2.9, 3.0, 9.0])[0], [np.nan, 1.0, 1.0])
-    assert log.modes == ((0.0, "MANUAL"),)
     assert log.start_utc_s is None
 
 
@@ -401,13 +391,12 @@ def test_the_real_telemetry_log(samples: Path) -> None:
     assert log.sources["depth"] == "GLOBAL_POSITION_INT.relative_alt"
     assert log.span_s[1] == pytest.approx(263.6, abs=0.1)
     assert log.heading is not None
-    assert log.heading.rate_hz == pytest.approx(20.0, abs=0.1)
+    assert np.median(np.diff(log.heading.time_s)) == pytest.approx(0.05, abs=2e-4)
     # 4 May 2023, from the first attitude.
     assert log.start_utc_s == pytest.approx(1683220541.0, abs=1.0)
     # Bobbing at the surface.
     assert log.depth is not None
     assert np.abs(log.depth.values).max() < 0.4
-    assert {mode for _, mode in log.modes} == {"MANUAL"}
 
 
 @pytest.mark.samples

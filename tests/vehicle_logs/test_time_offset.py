@@ -282,7 +282,7 @@ def test_real_motion_is_recognised(samples: Path) -> None:
     noise = np.radians(0.4) * rng.normal(size=(2, len(time_s)))
     for offset_s in (10.0, 87.7, 150.3):
         when = time_s + offset_s
-        yaw = 3.0 - np.interp(when, log.heading.time_s, log.heading.unwrapped()) + noise[0]
+        yaw = 3.0 - np.interp(when, log.heading.time_s, np.unwrap(log.heading.values)) + noise[0]
         pitch = -np.interp(when, log.pitch.time_s, log.pitch.values) + noise[1]
         found = is_offset(
             find_time_offset(log, PostureTrack(time_s, yaw, pitch, np.ones(len(time_s), bool)))

@@ -9,10 +9,10 @@ Records read for each signal, with reasons:
 
 - attitude and heading: `ATT`, the attitude that the autopilot controls.
 - depth: `CTUN.Alt`, the filtered height that ArduSub controls, 0 at the surface. `POS` is relative
-  to home, which may be moved; the filter's own `XKF1.PD` is relative to where it started.
+  to home, which may be moved; the filter's own `XKF1.PD` (`NKF1` of older firmware), of the first
+  core, is relative to where it started.
   `CTUN.BAlt` and `BARO.Alt` are the unfiltered pressure sensor; of several `BARO`, the first is
   inside the hull, and another one in the water.
-- velocity: `XKF1` (`NKF1` of older firmware), of the first core.
 - UTC: `GPS` (leap seconds of 2017 subtracted), else `RTC`.
 """
 
@@ -26,8 +26,15 @@ from scipy import ndimage
 
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.vehicle_logs.tlog import SUB_MODES, Candidate, choose_depth, damage_notes
-from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of, wrap
+from aqualvs.vehicle_logs.tlog import Candidate, choose_depth, damage_notes
+from aqualvs.vehicle_logs.vehicle_log import (
+    Interpolation,
+    Signal,
+    VehicleLog,
+    bearing_of,
+    log_of,
+    wrap,
+)
 
 HEAD = b"\xa3\x95"
 _TYPES = {
@@ -100,10 +107,11 @@ def read_binary(data: bytes) -> Records:
     formats: dict[str, Format] = {}
     n_records, skipped = _scan(data, places, formats)
     octets = np.frombuffer(data, np.uint8)
-    tables: dict[str, dict[str, FloatArray]] = {}
-    for name, starts in places.items():
-        if starts:
-            tables[name] = _decode(octets, np.array(starts, np.int64), formats[name])
+    tables = {
+        name: _decode(octets, np.array(starts, np.int64), formats[name])
+        for name, starts in places.items()
+        if starts
+    }
     return _timed_records(tables, n_records, skipped)
 
 
@@ -254,7 +262,7 @@ def _plausible(times: FloatArray) -> BoolArray:
     return near
 
 
-_WANTED = ("ATT", "CTUN", "POS", "XKF1", "NKF1", "BARO", "GPS", "RTC", "MODE", "ARM", "EV")
+_WANTED = ("ATT", "CTUN", "POS", "XKF1", "NKF1", "BARO", "GPS", "RTC")
 
 _Tables = Mapping[str, Mapping[str, FloatArray]]
 
@@ -299,39 +307,38 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
             "of a dive"
         )
     begin = min(starts)
-    depth, stuck = _depth(tables, begin)
-    heading = _angle(tables, begin, "Yaw", Interpolation.BEARING)
-    roll = _angle(tables, begin, "Roll", Interpolation.ANGLE)
-    velocity, velocity_from = _velocity(tables, begin)
-    armed, armed_from = _armed(tables, begin)
+    candidates = [
+        Candidate(_signal(tables, begin, record, column, scale), f"{record}.{column}")
+        for record, column, scale in (
+            ("CTUN", "Alt", -1.0),
+            ("POS", "RelHomeAlt", -1.0),
+            ("XKF1", "PD", 1.0),
+            ("NKF1", "PD", 1.0),
+            ("CTUN", "BAlt", -1.0),
+        )
+    ]
+    pressure = candidates[-1].depth
+    depth, stuck = choose_depth([*candidates, _barometer(tables, begin)], pressure)
+    found = {"depth": depth}
+    for name, column, interpolation in (
+        ("heading", "Yaw", Interpolation.BEARING),
+        ("roll", "Roll", Interpolation.ANGLE),
+        ("pitch", "Pitch", Interpolation.ANGLE),
+    ):
+        found[name] = Candidate(_angle(tables, begin, column, interpolation), f"ATT.{column}")
     utc, utc_from = _start_utc(tables, begin)
-    sources = {
-        "depth": depth.label if depth else "",
-        "heading": "ATT.Yaw" if heading else "",
-        "roll": "ATT.Roll" if roll else "",
-        "pitch": "ATT.Pitch" if roll else "",
-        "velocity_ned": velocity_from,
-        "armed": armed_from,
-        "start_utc_s": utc_from,
-    }
     # The vehicle's clock is set once, to about a second.
     utc_sigma_s = 1.0
     damage = damage_notes(records.skipped, unit, "records")
     if records.n_bogus:
         damage.append(f"{records.n_bogus} records have an impossible time and are left out")
-    return VehicleLog(
-        name=str(path),
-        kind=kind,
-        depth=depth.depth if depth else None,
-        heading=heading,
-        roll=roll,
-        pitch=_angle(tables, begin, "Pitch", Interpolation.ANGLE),
-        velocity_ned=velocity,
-        armed=armed,
-        modes=_modes(tables, begin),
+    return log_of(
+        path,
+        kind,
+        found,
         start_utc_s=utc,
         start_utc_sigma_s=None if utc is None else utc_sigma_s,
-        sources={name: where for name, where in sources.items() if where},
+        sources={} if utc is None else {"start_utc_s": utc_from},
         notes=tuple(n for n in (*damage, stuck) if n),
     )
 
@@ -368,94 +375,21 @@ def _angle(
     table = tables.get("ATT")
     if table is None or column not in table:
         return None
-    # Records have no checksum: damaged ones may contain any number.
     largest_deg = 720.0
     angle = np.deg2rad(np.where(np.abs(table[column]) <= largest_deg, table[column], np.nan))
     angle = bearing_of(angle) if interpolation is Interpolation.BEARING else wrap(angle)
     return Signal.from_samples(table["time_s"] - begin, angle, interpolation)
 
 
-def _depth(tables: _Tables, begin: float) -> tuple[Candidate | None, str | None]:
-    """Return the chosen depth, and a note on one that is stuck."""
-    candidates = [
-        Candidate(f"{kind}.{column}", _signal(tables, begin, kind, column, scale))
-        for kind, column, scale in (
-            ("CTUN", "Alt", -1.0),
-            ("POS", "RelHomeAlt", -1.0),
-            ("XKF1", "PD", 1.0),
-            ("NKF1", "PD", 1.0),
-            ("CTUN", "BAlt", -1.0),
-        )
-    ]
-    pressure = candidates[-1].depth
-    return choose_depth([*candidates, _barometer(tables, begin)], pressure)
-
-
 def _barometer(tables: _Tables, begin: float) -> Candidate:
     """Return the depth by the last barometer, which is the one in the water."""
     table = tables.get("BARO")
     if table is None or "Alt" not in table:
-        return Candidate("BARO.Alt", None)
+        return Candidate(None, "BARO.Alt")
     number = table.get("I", np.zeros(len(table["Alt"])))
     outer = number == number.max()
-    label = f"BARO.Alt of sensor {number.max():.0f}"
-    return Candidate(
-        label, Signal.from_samples(table["time_s"][outer] - begin, -table["Alt"][outer])
-    )
-
-
-def _velocity(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
-    for name in ("XKF1", "NKF1"):
-        table = tables.get(name)
-        if table is None or not {"VN", "VE", "VD"} <= set(table):
-            continue
-        parts = np.stack([table["VN"], table["VE"], table["VD"]], axis=1)
-        velocity = Signal.from_samples(table["time_s"] - begin, parts)
-        if velocity is not None:
-            return velocity, f"{name}.VN, VE, VD"
-    return None, ""
-
-
-def _armed(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
-    """Return whether the vehicle is armed, and the source.
-
-    It is logged at changes only, so that the signal has no gaps.
-    """
-    table = tables.get("ARM")
-    # DATA_ARMED and DATA_DISARMED of ArduPilot's log events.
-    armed_event, disarmed_event = 10, 11
-    if table is not None and "ArmState" in table:
-        times, state, where = table["time_s"], table["ArmState"], "ARM.ArmState"
-    else:
-        table = tables.get("EV")
-        if table is None or "Id" not in table:
-            return None, ""
-        is_event = (table["Id"] == armed_event) | (table["Id"] == disarmed_event)
-        times, where = table["time_s"][is_event], "EV.Id"
-        state = (table["Id"][is_event] == armed_event).astype(float)
-    signal = Signal.from_samples(times - begin, (state > 0.0).astype(float), Interpolation.HELD)
-    if signal is None:
-        return None, ""
-    times, values = signal.time_s, signal.values
-    end = max(float(t["time_s"][-1]) for t in tables.values()) - begin
-    if end > times[-1]:
-        times, values = np.append(times, end), np.append(values, values[-1])
-    return Signal(times, values, signal.interpolation, np.inf), where
-
-
-def _modes(tables: _Tables, begin: float) -> tuple[tuple[float, str], ...]:
-    """Return the times and names of flight modes."""
-    table = tables.get("MODE")
-    if table is None:
-        return ()
-    numbers = table.get("ModeNum", table.get("Mode"))
-    if numbers is None:
-        return ()
-    return tuple(
-        (float(time) - begin, SUB_MODES.get(int(number), f"mode {number:.0f}"))
-        for time, number in zip(table["time_s"], numbers, strict=True)
-        if np.isfinite(number)
-    )
+    depth = Signal.from_samples(table["time_s"][outer] - begin, -table["Alt"][outer])
+    return Candidate(depth, f"BARO.Alt of sensor {number.max():.0f}")
 
 
 def _start_utc(tables: _Tables, begin: float) -> tuple[float | None, str]:

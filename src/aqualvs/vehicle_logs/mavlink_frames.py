@@ -59,6 +59,7 @@ MESSAGES: Mapping[int, Message] = {
         50,
     ),
     30: Message("ATTITUDE", (_BOOT, *_floats("roll pitch yaw rollspeed pitchspeed yawspeed")), 39),
+    # For its time alone.
     32: Message("LOCAL_POSITION_NED", (_BOOT, *_floats("x y z vx vy vz")), 185),
     33: Message(
         "GLOBAL_POSITION_INT",

@@ -41,7 +41,7 @@ class Rates:
 def rates_of(angle: Signal, start_s: float, end_s: float) -> Rates:
     """Return the band-passed rates of an angle on a grid from one time to another."""
     times: FloatArray = np.arange(start_s, end_s + STEP_S, STEP_S, dtype=np.float64)
-    unwrapped = Signal(angle.time_s, angle.unwrapped(), Interpolation.LINEAR, angle.max_gap_s)
+    unwrapped = Signal(angle.time_s, np.unwrap(angle.values), Interpolation.LINEAR, angle.max_gap_s)
     values, valid = unwrapped.at(times)
     rate, known = _slopes(np.where(valid, values, 0.0), valid)
     rate = rate - _smooth(np.where(known, rate, 0.0), known)
@@ -52,14 +52,9 @@ def rates_of(angle: Signal, start_s: float, end_s: float) -> Rates:
 
 
 def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
-    """Return the mask of valid samples near their neighbours (a Hampel filter).
+    """Return the mask (n,) of valid samples near their neighbours (a Hampel filter).
 
-    Parameters
-    ----------
-    angle : array, shape (n,)
-        Radians, in the order of time.
-    valid : bool array, shape (n,)
-        Samples to consider.
+    `angle`, shape (n,): in radians and in the order of time.
     """
     values, kept = np.asarray(angle, float), np.array(valid, bool)
     kept &= np.isfinite(values)
@@ -178,10 +173,8 @@ def scores_of(channels: tuple[Channel, ...]) -> OffsetScores:
         opposite = np.clip(-rho, 0.0, 0.9999)
         score -= 0.5 * independent * np.log1p(-(opposite**2))
         overlap = np.maximum(overlap, count * STEP_S)
-    offset_s: FloatArray = (
-        first.logged.start_s - first.seen.start_s + STEP_S * lags.astype(np.float64)
-    )
-    return OffsetScores(offset_s, score, overlap)
+    begin_s = first.logged.start_s - first.seen.start_s
+    return OffsetScores(begin_s + STEP_S * lags.astype(np.float64), score, overlap)
 
 
 def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
@@ -213,14 +206,10 @@ class Match:
     # Shape (n,): seen rate minus its prediction from the logged one; the seen rate itself where the
     # logged one is not valid.
     residual: FloatArray
-    # Shape (n,): where both rates are valid.
-    predicted: BoolArray
-    # Ratio of the seen to the (opposite) logged motion: 1 for a plane, still net.
-    gain: float
-    # Shape (n,): derivative of the logged rate, 0 where not valid.
-    slope: FloatArray
-    # Of seen and opposite logged rates.
-    correlation: float
+    predicted: BoolArray  # Shape (n,): where both rates are valid.
+    gain: float  # Ratio of the seen to the (opposite) logged motion: 1 for a plane, still net.
+    slope: FloatArray  # Shape (n,): derivative of the logged rate, 0 where not valid.
+    correlation: float  # Of seen and opposite logged rates.
 
 
 def match_at(channel: Channel, offset_s: float) -> Match:
@@ -235,12 +224,13 @@ def match_at(channel: Channel, offset_s: float) -> Match:
     rate, slope = _between(logged.rate, below, where - below)
     y = seen.rate
     residual = np.where(seen.valid, y, 0.0)
+    nothing = Match(residual, both, 0.0, np.zeros(len(y)), 0.0)
     if np.count_nonzero(both) < 3:
-        return Match(residual, both, 0.0, np.zeros(len(y)), 0.0)
+        return nothing
     dx, dy = rate - rate[both].mean(), y - y[both].mean()
     sxx, syy, sxy = dx[both] @ dx[both], dy[both] @ dy[both], dx[both] @ dy[both]
     if sxx <= 0.0 or syy <= 0.0:
-        return Match(residual, both, 0.0, np.zeros(len(y)), 0.0)
+        return nothing
     gain = max(-float(sxy / sxx), 0.0)
     residual = np.where(both, dy + gain * dx, residual)
     correlation = -float(sxy / np.sqrt(sxx * syy))

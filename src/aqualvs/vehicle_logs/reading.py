@@ -31,6 +31,7 @@ from aqualvs.vehicle_logs.vehicle_log import (
     Signal,
     VehicleLog,
     bearing_of,
+    log_of,
     utc_seconds,
     wrap,
 )
@@ -200,23 +201,23 @@ def _log(
     if repeated:
         notes = (*notes, f"{repeated} rows repeat the time of the row before and are left out")
 
-    def angle(name: str, interpolation: Interpolation) -> Signal | None:
-        if name not in table:
-            return None
-        values = np.deg2rad(table[name])
-        values = bearing_of(values) if interpolation is Interpolation.BEARING else wrap(values)
-        return Signal.from_samples(time_s, values, interpolation)
-
-    return VehicleLog(
-        name=str(path),
-        kind="csv",
-        depth=Signal.from_samples(time_s, table["depth_m"]) if "depth_m" in table else None,
-        heading=angle("heading_deg", Interpolation.BEARING),
-        roll=angle("roll_deg", Interpolation.ANGLE),
-        pitch=angle("pitch_deg", Interpolation.ANGLE),
+    found: dict[str, tuple[Signal | None, str]] = {}
+    for column in VALUE_COLUMNS:
+        if column not in table:
+            continue
+        values, interpolation = table[column], Interpolation.LINEAR
+        if column == "heading_deg":
+            values, interpolation = bearing_of(np.deg2rad(values)), Interpolation.BEARING
+        elif column != "depth_m":
+            values, interpolation = wrap(np.deg2rad(values)), Interpolation.ANGLE
+        signal = Signal.from_samples(time_s, values, interpolation)
+        found[column.rsplit("_", 1)[0]] = signal, f"column {column}"
+    return log_of(
+        path,
+        "csv",
+        found,
         start_utc_s=start_utc_s,
         start_utc_sigma_s=None if start_utc_s is None else NETWORK_UTC_SIGMA_S,
-        sources={n.rsplit("_", 1)[0]: f"column {n}" for n in VALUE_COLUMNS if n in table},
         notes=notes,
     )
 
@@ -232,22 +233,10 @@ _OTHERS = {
 def read_vehicle_log(path: str | Path) -> VehicleLog:
     """Read a vehicle's log; the content determines the format, not the name.
 
-    Parameters
-    ----------
-    path : str or Path
-        CSV table, MAVLink telemetry log (`.tlog`) or ArduPilot dataflash log (`.BIN`, or its text
-        form `.log`).
-
-    Returns
-    -------
-    log : VehicleLog
-        Of a truncated or damaged file, the readable part; `log.notes` describes the rest.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read or holds neither depth nor heading; one line that names the
-        file, the value and the remedy.
+    `path`: CSV table, MAVLink telemetry log (`.tlog`) or ArduPilot dataflash log (`.BIN`, or its
+    text form `.log`). Of a truncated or damaged file, the readable part is returned; `log.notes`
+    describes the rest. Raises `SourceError` if the file cannot be read or holds neither depth nor
+    heading; one line that names the file, the value and the remedy.
     """
     source = Path(path)
     refuse_special(source)

@@ -63,8 +63,7 @@ class TimeOffset:
     # Of the vehicle's and the net's motion at this offset, 1 for full agreement; None if the offset
     # does not come from motion.
     correlation: float | None
-    # Description of the source.
-    how: str
+    how: str  # Description of the source.
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,21 +82,9 @@ def find_time_offset(
 ) -> TimeOffset | OffsetRefusal:
     """Find the offset at which log and dive show the same motion.
 
-    Parameters
-    ----------
-    log : VehicleLog
-        Log with heading, pitch or both.
-    posture_track : PostureTrack
-        Posture of the dive.
-    start : TimeOffset, optional
-        Offset by the clocks. If motion alone is ambiguous, only offsets within four of its sigmas
-        are considered.
-
-    Returns
-    -------
-    offset : TimeOffset or OffsetRefusal
-        A refusal if no offset is clearly the best: too little motion or overlap, or motion that
-        repeats itself.
+    It is refused if no offset is clearly the best: too little motion or overlap, or motion that
+    repeats itself. `start`: offset by the clocks; if motion alone is ambiguous, only offsets within
+    four of its sigmas are considered.
 
     Notes
     -----
@@ -127,22 +114,24 @@ def find_time_offset(
 
 def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | OffsetRefusal:
     """Return the rates of the angles that both dive and log have, each on one grid."""
-    pairs = [("yaw", track.yaw, log.heading), ("pitch", track.pitch, log.pitch)]
-    logged = [(name, seen, angle) for name, seen, angle in pairs if angle is not None]
-    if not logged:
+    pairs: list[tuple[str, Signal, Signal]] = []
+    for name, values, logged in (
+        ("yaw", track.yaw, log.heading),
+        ("pitch", track.pitch, log.pitch),
+    ):
+        if logged is None:
+            continue
+        kept = without_outliers(values, track.valid)
+        seen = Signal.from_samples(track.time_s[kept], values[kept])
+        if seen is None:
+            return OffsetRefusal("the dive has no valid posture; give the offset yourself")
+        pairs.append((name, seen, logged))
+    if not pairs:
         return OffsetRefusal(
             f"{log.name} holds neither heading nor pitch; give the offset yourself"
         )
-    seen = [
-        Signal.from_samples(track.time_s[kept], values[kept])
-        for _, values, _ in logged
-        for kept in (without_outliers(values, track.valid),)
-    ]
-    tracks = [angle for angle in seen if angle is not None]
-    if len(tracks) < len(seen):
-        return OffsetRefusal("the dive has no valid posture; give the offset yourself")
-    dive = min(a.time_s[0] for a in tracks), max(a.time_s[-1] for a in tracks)
-    span = min(a.time_s[0] for _, _, a in logged), max(a.time_s[-1] for _, _, a in logged)
+    dive = min(a.time_s[0] for _, a, _ in pairs), max(a.time_s[-1] for _, a, _ in pairs)
+    span = min(a.time_s[0] for _, _, a in pairs), max(a.time_s[-1] for _, _, a in pairs)
     longest_s = 24 * 3600.0
     for what, (begin, end) in (("the dive", dive), (log.name, span)):
         if end - begin > longest_s:
@@ -151,8 +140,8 @@ def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | Off
                 "times are seconds"
             )
     return tuple(
-        Channel(name, rates_of(track_of, *dive), rates_of(angle, *span))
-        for (name, _, angle), track_of in zip(logged, tracks, strict=True)
+        Channel(name, rates_of(seen, *dive), rates_of(logged, *span))
+        for name, seen, logged in pairs
     )
 
 
@@ -330,17 +319,8 @@ recording or the time of copying, and few cameras' clocks are set more accuratel
 def dive_start_utc(video: str | Path) -> float | None:
     """Return the UTC of a video's creation according to its container, in seconds since 1970.
 
-    Only the container's `creation_time` is used; times of the file change when it is copied.
-
-    Parameters
-    ----------
-    video : str or Path
-        A video file.
-
-    Returns
-    -------
-    start_utc_s : float or None
-        None if the container does not state it, or states the zero of its calendar.
+    Only the container's `creation_time` is used; times of the file change when it is copied. None
+    if the container does not state it, or states the zero of its calendar.
     """
     import av
 
@@ -362,14 +342,7 @@ def offset_from_clocks(
 ) -> TimeOffset | OffsetRefusal:
     """Return the offset by the clocks of dive and log.
 
-    Parameters
-    ----------
-    log : VehicleLog
-        Log with `start_utc_s`.
-    dive_start_utc_s : float or None
-        UTC of dive time 0.
-    sigma_s : float
-        Standard deviation of `dive_start_utc_s`.
+    `dive_start_utc_s`: UTC of dive time 0, with the standard deviation `sigma_s`.
     """
     if log.start_utc_s is None or log.start_utc_sigma_s is None:
         return OffsetRefusal(f"{log.name} does not know the time of day")

@@ -9,7 +9,6 @@ Messages read for each signal, with reasons:
   `VFR_HUD.alt` is above mean sea level and 0 without a home; `AHRS2.altitude` is that of the backup
   estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, gives changes only, because the
   log does not contain the pressure at the surface. `choose_depth` takes the first that changes.
-- velocity: `LOCAL_POSITION_NED`, then `GLOBAL_POSITION_INT` in cm/s.
 
 `TelemetryClock` gives all messages times of the autopilot's clock, across reboots, and its UTC.
 """
@@ -17,6 +16,7 @@ Messages read for each signal, with reasons:
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,15 +30,15 @@ from aqualvs.vehicle_logs.vehicle_log import (
     Signal,
     VehicleLog,
     bearing_of,
+    log_of,
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
+class Candidate(NamedTuple):
     """Candidate for the depth in a log."""
 
-    label: str  # Message or record, and field.
     depth: Signal | None  # Metres, positive down; None if the log does not have it.
+    source: str  # Message or record, and field.
 
 
 def damage_notes(skipped: Sequence[tuple[int, int]], unit: str, what: str) -> list[str]:
@@ -54,16 +54,11 @@ def damage_notes(skipped: Sequence[tuple[int, int]], unit: str, what: str) -> li
 
 def choose_depth(
     candidates: Sequence[Candidate], pressure_depth: Signal | None
-) -> tuple[Candidate | None, str | None]:
+) -> tuple[Candidate, str | None]:
     """Return the first candidate with a changing depth, and a note on one that is stuck.
 
-    Parameters
-    ----------
-    candidates : sequence of Candidate
-        In the order of preference.
-    pressure_depth : Signal or None
-        Depth by the outer pressure, up to a constant. A filter without an origin reports a constant
-        instead of the depth, although the pressure changes.
+    A filter without an origin reports a constant instead of the depth, although the pressure
+    changes. `pressure_depth`: depth by the outer pressure, up to a constant.
     """
     dived = 0.0 if pressure_depth is None else _span(pressure_depth)
     note = None
@@ -74,12 +69,12 @@ def choose_depth(
             continue
         if dived > min_dive_m and _span(candidate.depth) < stuck_share * dived:
             note = note or (
-                f"{candidate.label} stands still while the pressure changes by {dived:.1f} m of "
+                f"{candidate.source} stands still while the pressure changes by {dived:.1f} m of "
                 "water; not used"
             )
             continue
         return candidate, note
-    return None, note
+    return Candidate(None, ""), note
 
 
 def _span(depth: Signal) -> float:
@@ -169,21 +164,6 @@ def _with_utc(
     return TelemetryClock(table.at, log_s, boot_at, boot_s, start, sigma, notes)
 
 
-SUB_MODES = {
-    0: "STABILIZE",
-    1: "ACRO",
-    2: "ALT_HOLD",
-    3: "AUTO",
-    4: "GUIDED",
-    7: "CIRCLE",
-    9: "SURFACE",
-    16: "POSHOLD",
-    19: "MANUAL",
-    20: "MOTOR_DETECT",
-    21: "SURFTRAK",
-}
-"""ArduSub's flight modes (ArduSub/mode.h)."""
-
 DEPTH_FIELDS = (
     ("GLOBAL_POSITION_INT", "relative_alt", -1e-3),
     ("VFR_HUD", "alt", -1.0),
@@ -207,36 +187,24 @@ def read_tlog(path: Path) -> VehicleLog:
     own = {name: table[table.source == source] for name, table in frames.tables.items()}
     tables = {name: table for name, table in own.items() if len(table.at)}
     clock = telemetry_clock(tables)
-    depth, stuck = _depth(tables, clock)
-    heading, heading_from = _heading(tables, clock)
-    velocity, velocity_from = _velocity(tables, clock)
-    roll = _signal(tables, clock, "ATTITUDE", "roll", interpolation=Interpolation.ANGLE)
-    pitch = _signal(tables, clock, "ATTITUDE", "pitch", interpolation=Interpolation.ANGLE)
-    armed, modes = _armed_and_modes(tables, clock)
-    sources = {
-        "depth": depth.label if depth else "",
-        "heading": heading_from,
-        "roll": "ATTITUDE.roll" if roll else "",
-        "pitch": "ATTITUDE.pitch" if pitch else "",
-        "velocity_ned": velocity_from,
-        "armed": "HEARTBEAT.base_mode" if armed else "",
-    }
+    candidates = [
+        Candidate(_signal(tables, clock, message, field, scale), f"{message}.{field}")
+        for message, field, scale in DEPTH_FIELDS
+    ]
+    depth, stuck = choose_depth(candidates, _signal(tables, clock, *PRESSURE_FIELD))
+    found = {"depth": depth, "heading": _heading(tables, clock)}
+    for name in ("roll", "pitch"):
+        angle = _signal(tables, clock, "ATTITUDE", name, interpolation=Interpolation.ANGLE)
+        found[name] = angle, f"ATTITUDE.{name}"
     damage = damage_notes(frames.skipped, "bytes", "messages")
     if frames.n_failed:
         damage.append(f"{frames.n_failed} messages have a wrong checksum and are left out")
-    return VehicleLog(
-        name=str(path),
-        kind="tlog",
-        depth=depth.depth if depth else None,
-        heading=heading,
-        roll=roll,
-        pitch=pitch,
-        velocity_ned=velocity,
-        armed=armed,
-        modes=modes,
+    return log_of(
+        path,
+        "tlog",
+        found,
         start_utc_s=clock.start_utc_s,
         start_utc_sigma_s=clock.start_utc_sigma_s,
-        sources={name: where for name, where in sources.items() if where},
         notes=tuple(n for n in (others, *damage, *clock.notes, stuck) if n),
     )
 
@@ -287,14 +255,6 @@ def _signal(
     return Signal.from_samples(clock.of(table), values, interpolation)
 
 
-def _depth(tables: _Tables, clock: TelemetryClock) -> tuple[Candidate | None, str | None]:
-    candidates = [
-        Candidate(f"{message}.{field}", _signal(tables, clock, message, field, scale))
-        for message, field, scale in DEPTH_FIELDS
-    ]
-    return choose_depth(candidates, _signal(tables, clock, *PRESSURE_FIELD))
-
-
 def _heading(tables: _Tables, clock: TelemetryClock) -> _Found:
     """Return the heading from the best message that has it, and its source."""
     heading = _signal(tables, clock, "ATTITUDE", "yaw", interpolation=Interpolation.BEARING)
@@ -311,39 +271,4 @@ def _heading(tables: _Tables, clock: TelemetryClock) -> _Found:
             return heading, "GLOBAL_POSITION_INT.hdg"
     scale = float(np.deg2rad(1.0))
     heading = _signal(tables, clock, "VFR_HUD", "heading", scale, Interpolation.BEARING)
-    return heading, "VFR_HUD.heading (whole degrees)" if heading else ""
-
-
-def _velocity(tables: _Tables, clock: TelemetryClock) -> _Found:
-    for message, scale in (("LOCAL_POSITION_NED", 1.0), ("GLOBAL_POSITION_INT", 0.01)):
-        table = tables.get(message)
-        if table is None:
-            continue
-        parts = [scale * table.payload[name].astype(float) for name in ("vx", "vy", "vz")]
-        velocity = Signal.from_samples(clock.of(table), np.stack(parts, axis=1))
-        if velocity is not None:
-            return velocity, f"{message}.vx, vy, vz"
-    return None, ""
-
-
-def _armed_and_modes(
-    tables: _Tables, clock: TelemetryClock
-) -> tuple[Signal | None, tuple[tuple[float, str], ...]]:
-    """Return whether the vehicle is armed, and times and names of its flight modes."""
-    table = tables.get("HEARTBEAT")
-    if table is None:
-        return None, ()
-    times, beat = clock.of(table), table.payload
-    # MAV_MODE_FLAG_SAFETY_ARMED.
-    armed_flag = 128
-    armed = (beat["base_mode"] & armed_flag > 0).astype(float)
-    number = beat["custom_mode"].astype(np.int64)
-    changed = np.flatnonzero(np.diff(number, prepend=-1))
-    # MAV_AUTOPILOT_ARDUPILOTMEGA and MAV_TYPE_SUBMARINE.
-    ardupilot, submarine = 3, 12
-    is_sub = (beat["autopilot"] == ardupilot) & (beat["type"] == submarine)
-    modes = []
-    for i in changed.tolist():
-        name = f"mode {number[i]}"
-        modes.append((float(times[i]), SUB_MODES.get(number[i], name) if is_sub[i] else name))
-    return Signal.from_samples(times, armed, Interpolation.HELD), tuple(modes)
+    return heading, "VFR_HUD.heading (whole degrees)"

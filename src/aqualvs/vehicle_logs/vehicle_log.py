@@ -10,15 +10,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Self, TypeAlias
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-
-IndexArray: TypeAlias = NDArray[np.intp]
 
 _TURN = 2.0 * math.pi
 
@@ -32,8 +31,6 @@ class Interpolation(StrEnum):
     """Linear along the shorter arc; results are in (-pi, pi]."""
     BEARING = "bearing"
     """As ANGLE, but results are in [0, 2 pi)."""
-    HELD = "held"
-    """Value of the last sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +38,7 @@ class Signal:
     """A quantity with its own time stamps."""
 
     time_s: FloatArray  # Shape (n,): log time, strictly increasing; n is at least 1.
-    values: FloatArray  # Shape (n,) or (n, k): finite; SI units and radians.
+    values: FloatArray  # Shape (n,): finite; SI units and radians.
     interpolation: Interpolation  # Between samples.
     max_gap_s: float  # Values between samples further apart than this are not valid.
 
@@ -58,9 +55,7 @@ class Signal:
         that of all samples before them.
         """
         times, found = np.asarray(time_s, float), np.asarray(values, float)
-        if not len(times):
-            return None
-        finite = np.isfinite(times) & np.isfinite(found.reshape(len(times), -1)).all(axis=1)
+        finite = np.isfinite(times) & np.isfinite(found)
         times, found = times[finite], found[finite]
         if not len(times):
             return None
@@ -69,31 +64,10 @@ class Signal:
         times, found = times[later], found[later]
         return cls(times, found, interpolation, usual_gap(times))
 
-    @property
-    def n_gaps(self) -> int:
-        """Number of gaps between the first and the last sample."""
-        return int(np.count_nonzero(np.diff(self.time_s) > self.max_gap_s))
-
-    @property
-    def rate_hz(self) -> float:
-        """Usual rate of the samples; 0 for a single one."""
-        steps = np.diff(self.time_s)
-        return 1.0 / float(np.median(steps)) if len(steps) else 0.0
-
     def at(self, time_s: ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """Return the values at other times.
+        """Return the values (m,) at other log times (m,), in any order, and where they are valid.
 
-        Parameters
-        ----------
-        time_s : array, shape (m,)
-            Log time, in any order.
-
-        Returns
-        -------
-        values : array, shape (m,) or (m, k)
-            NaN where not valid.
-        valid : bool array, shape (m,)
-            False before the first sample, after the last one and inside a gap.
+        Before the first sample, after the last one and inside a gap they are not, and NaN.
         """
         times = np.atleast_1d(np.asarray(time_s, float))
         last = len(self.time_s) - 1
@@ -104,29 +78,16 @@ class Signal:
         valid = inside | (times == start) | (times == end)
         share = np.where(inside, (times - start) / np.where(end > start, end - start, 1.0), 0.0)
         # `before` is the sample itself where the times agree, because of side="right".
-        values = self._between(before, after, share)
-        values[~valid] = np.nan
-        return values, valid
-
-    def _between(self, before: IndexArray, after: IndexArray, share: FloatArray) -> FloatArray:
-        """Interpolate between samples; `share` is 0 at `before` and 1 at `after`."""
-        first: FloatArray = self.values[before]
-        if self.interpolation is Interpolation.HELD:
-            return first.copy()
-        step = self.values[after] - first
+        step = self.values[after] - self.values[before]
         if self.interpolation is not Interpolation.LINEAR:
             step = wrap(step)
-        between: FloatArray = first + (share if first.ndim == 1 else share[:, None]) * step
+        values = self.values[before] + share * step
         if self.interpolation is Interpolation.ANGLE:
-            return wrap(between)
-        return bearing_of(between) if self.interpolation is Interpolation.BEARING else between
-
-    def unwrapped(self) -> FloatArray:
-        """Return an angle's samples without jumps of a full turn.
-
-        Across a gap the shorter way round is assumed.
-        """
-        return np.unwrap(self.values, axis=0)
+            values = wrap(values)
+        elif self.interpolation is Interpolation.BEARING:
+            values = bearing_of(values)
+        values[~valid] = np.nan
+        return values, valid
 
 
 def usual_gap(time_s: FloatArray) -> float:
@@ -199,12 +160,6 @@ class VehicleLog:
     # pitch with the nose up.
     roll: Signal | None = None
     pitch: Signal | None = None
-    # North, east and down, in m/s.
-    velocity_ned: Signal | None = None
-    # 1 while the thrusters can turn, else 0.
-    armed: Signal | None = None
-    # Log time of each change of the flight mode, and the new mode.
-    modes: tuple[tuple[float, str], ...] = ()
     # UTC (seconds since 1970) of log time 0, and its standard deviation; None if unknown.
     start_utc_s: float | None = None
     start_utc_sigma_s: float | None = None
@@ -216,19 +171,14 @@ class VehicleLog:
     @property
     def signals(self) -> dict[str, Signal]:
         """The continuous signals that the log has, by name."""
-        names = ("depth", "heading", "roll", "pitch", "velocity_ned")
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        found = {name: getattr(self, name) for name in ("depth", "heading", "roll", "pitch")}
+        return {name: signal for name, signal in found.items() if signal is not None}
 
     @property
     def span_s(self) -> tuple[float, float]:
         """First and last log time of any signal; both NaN for a log without signals."""
-        found = list(self.signals.values())
-        if not found:
-            return float("nan"), float("nan")
-        return (
-            float(min(signal.time_s[0] for signal in found)),
-            float(max(signal.time_s[-1] for signal in found)),
-        )
+        times = [signal.time_s for signal in self.signals.values()] or [np.array([np.nan])]
+        return float(min(one[0] for one in times)), float(max(one[-1] for one in times))
 
     def at(self, time_s: ArrayLike) -> LoggedStates:
         """Return the vehicle's state at other times; values in gaps are not valid.
@@ -243,6 +193,16 @@ class VehicleLog:
             values, valid = nothing if signal is None else signal.at(times)
             found |= {name: values, f"{name}_valid": valid}
         return LoggedStates(time_s=times, **found)
+
+
+def log_of(
+    path: Path, kind: str, found: Mapping[str, tuple[Signal | None, str]], **others: Any
+) -> VehicleLog:
+    """Return the log of signals with their sources, by name; `others`: its further fields."""
+    known = {name: pair for name, pair in found.items() if pair[0] is not None}
+    signals: dict[str, Any] = {name: signal for name, (signal, _) in known.items()}
+    sources = {name: source for name, (_, source) in known.items()} | others.pop("sources", {})
+    return VehicleLog(name=str(path), kind=kind, sources=sources, **signals, **others)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -344,16 +304,9 @@ class VehiclePlaces:
 def ned_from_dome_of(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
     """Return rotations from `dome` (right, forward, up) to north, east, down.
 
-    Parameters
-    ----------
-    heading, pitch, roll : array, shape (n,)
-        Of the vehicle, radians, as MAVLink's ATTITUDE: heading clockwise from north, pitch positive
-        with the nose up, roll positive with the right side down; applied in the order roll, pitch,
-        heading.
-
-    Returns
-    -------
-    ned_from_dome : array, shape (n, 3, 3)
+    The angles are the vehicle's, shape (n,), in radians, as in MAVLink's ATTITUDE: heading
+    clockwise from north, pitch positive with the nose up, roll positive with the right side down;
+    applied in the order roll, pitch, heading. The result has shape (n, 3, 3).
     """
     turn, nod, tilt = np.broadcast_arrays(*(np.asarray(a, float) for a in (heading, pitch, roll)))
     ch, sh, cp, sp = np.cos(turn), np.sin(turn), np.cos(nod), np.sin(nod)

@@ -52,7 +52,7 @@ from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink,
 from aqualvs.live.mavlink.peers import SAFETY_ARMED
 from aqualvs.scanning.scan import GyroRates
 from aqualvs.text import Severity
-from aqualvs.vehicle_logs.tlog import DEPTH_FIELDS, PRESSURE_FIELD, SUB_MODES
+from aqualvs.vehicle_logs.tlog import DEPTH_FIELDS, PRESSURE_FIELD
 
 FRESH_S = 1.0
 """Older messages are ignored; ground stations send sticks 5 to 50 times a second."""
@@ -158,6 +158,20 @@ class DepthChoice:
 
 _AUTOPILOT = 1
 _ARDUPILOT, _SUBMARINE, _GROUND_STATION = 3, 12, 6
+# ArduSub's flight modes (ArduSub/mode.h).
+_MODES: Final = {
+    0: "STABILIZE",
+    1: "ACRO",
+    2: "ALT_HOLD",
+    3: "AUTO",
+    4: "GUIDED",
+    7: "CIRCLE",
+    9: "SURFACE",
+    16: "POSHOLD",
+    19: "MANUAL",
+    20: "MOTOR_DETECT",
+    21: "SURFTRAK",
+}
 # Two and a half of ArduSub's heartbeats.
 _BEATS_WITHIN_S = 2.5
 # Depth hold only: in other modes the vehicle sinks or rises at neutral sticks, or steers itself.
@@ -372,7 +386,7 @@ class ArduSubLink:
         known: dict[str, float] = {}
         for watch in self._shaping_watches:
             known = watch.read()
-        keeps_place = SUB_MODES.get(beat.message.custom_mode) == "POSHOLD"
+        keeps_place = _MODES.get(beat.message.custom_mode) == "POSHOLD"
         with self._sending:
             self._commander.shaping = shaping_of(known)
             self._commander.keeps_place = keeps_place
@@ -394,7 +408,7 @@ class ArduSubLink:
         heard = beat.message
         if heard.autopilot != _ARDUPILOT or heard.type != _SUBMARINE:
             return Mode.UNKNOWN, f"not ArduSub (vehicle type {heard.type})"
-        name = SUB_MODES.get(heard.custom_mode, f"mode {heard.custom_mode}")
+        name = _MODES.get(heard.custom_mode, f"mode {heard.custom_mode}")
         if name not in self.options.own_modes:
             return Mode.PILOT, name
         if self.link.conflict:
