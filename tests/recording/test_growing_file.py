@@ -8,8 +8,7 @@ import pytest
 
 from aqualvs.recording import growing_file
 from aqualvs.recording.encoding import POSTURE, TOPICS
-from aqualvs.recording.growing_file import PAGE
-from aqualvs.recording.recorder import recording_file
+from aqualvs.recording.growing_file import PAGE, GrowingFile
 from aqualvs.sources.mcap_file import FOOTER_BYTES, HEAD_BYTES, McapFile, Op, padding_head
 from recorder_cases import HistoryFile, chunk_of, played, read_by_mcap, read_by_rosbags
 
@@ -30,7 +29,7 @@ def begin():
     files = []
 
     def make(path, open_file=None):
-        files.append(recording_file(path, open_file))
+        files.append(GrowingFile(path, open_file))
         return files[-1]
 
     yield make
@@ -47,7 +46,7 @@ def history_of(tmp_path, chunks, *, close=True):
         opened.append(HistoryFile())
         return opened[0]
 
-    file = recording_file(tmp_path / "dive.mcap", open_file)
+    file = GrowingFile(tmp_path / "dive.mcap", open_file)
     after = [len(opened[0].steps)]
     for chunk in chunks:
         file.append(chunk)
@@ -118,7 +117,7 @@ def test_what_readers_see_changes_within_a_page(tmp_path):
         opened.append(HistoryFile())
         return opened[0]
 
-    file = recording_file(tmp_path / "dive.mcap", open_file)
+    file = GrowingFile(tmp_path / "dive.mcap", open_file)
     begun = len(opened[0].steps)
     for n in range(1, 700):
         chunk = chunk_of(n, n_messages=1 + n % 2, n_bytes=20)
@@ -180,7 +179,7 @@ def test_a_file_that_exists_is_left_alone(tmp_path):
     path = tmp_path / "dive.mcap"
     path.write_bytes(b"mine")
     with pytest.raises(FileExistsError):
-        recording_file(path)
+        GrowingFile(path)
     assert path.read_bytes() == b"mine"
     assert [one.name for one in tmp_path.iterdir()] == ["dive.mcap"]
 
@@ -191,10 +190,10 @@ def test_works_without_hard_links(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "link", refused)
     path = tmp_path / "dive.mcap"
-    recording_file(path).close()
+    GrowingFile(path).close()
     assert read_by_mcap(path) == []
     with pytest.raises(FileExistsError):
-        recording_file(path)
+        GrowingFile(path)
 
 
 class FullDisk:
@@ -293,7 +292,7 @@ def test_cost_of_a_chunk_does_not_grow_with_the_dive(tmp_path):
         opened.append(Counting())
         return opened[0]
 
-    file = recording_file(tmp_path / "dive.mcap", open_file)
+    file = GrowingFile(tmp_path / "dive.mcap", open_file)
     chunk = chunk_of(1, n_messages=3, n_bytes=60)
     content = chunk.content + b"\x80" + (40_000).to_bytes(8, "little") + bytes(40_000)
     chunk = chunk.__class__(

@@ -119,19 +119,9 @@ def rig_exact(rig: Rig) -> str:
 def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
     """Return the rig of a recording, to the last bit.
 
-    Parameters
-    ----------
-    text, exact : str
-        Text of the rig file, and that of `rig_exact`.
-    source_name : str
-        Name of the recording in messages.
-
-    Raises
-    ------
-    RigError
-        If the text is no rig file.
-    ValueError
-        If the numbers do not match it.
+    `text`: of the rig file. `exact`: from `rig_exact`. `source_name`: of the recording in messages.
+    Raises `RigError` if the text is no rig file. Raises `ValueError` if the numbers do not match
+    it.
     """
     content = parse_yaml(text, source_name, RigError)
     rig = rig_from_mapping(content, source_name=source_name, need_lasers=False)
@@ -322,12 +312,6 @@ class RecordedTopic:
     definition: str  # Of the message type and of all types in it.
 
 
-def _definition(own: str, *parts: tuple[str, str]) -> str:
-    """Return a definition with those of its parts, in the format of ROS 2's recordings."""
-    line = 80 * "=" + "\n"
-    return "".join([own, *(f"{line}MSG: {name}\n{text}" for name, text in parts)])
-
-
 _POSTURE = """\
 # Vehicle relative to the target; NaN where there is no value.
 std_msgs/Header header
@@ -478,38 +462,22 @@ string format
 uint8[] data
 """
 
-POSTURE = RecordedTopic(
-    1, "/aqualvs/posture", "aqualvs_msgs/msg/Posture", _definition(_POSTURE, _HEADER, _TIME)
-)
-STRIPES = RecordedTopic(
-    2,
-    "/aqualvs/stripes",
-    "aqualvs_msgs/msg/Stripes",
-    _definition(_STRIPES, _HEADER, _TIME, ("aqualvs_msgs/Returns", _PEAKS)),
-)
-POINTS = RecordedTopic(
-    3,
-    "/aqualvs/points",
-    "sensor_msgs/msg/PointCloud2",
-    _definition(_POINTS, _HEADER, _TIME, ("sensor_msgs/PointField", _FIELD)),
-)
-HEALTH = RecordedTopic(
-    4,
-    "/aqualvs/health",
-    "aqualvs_msgs/msg/Health",
-    _definition(
-        _HEALTH, _HEADER, _TIME, ("aqualvs_msgs/Part", _PART), ("aqualvs_msgs/Delay", _DELAY)
-    ),
-)
-RIG = RecordedTopic(5, "/aqualvs/rig", "aqualvs_msgs/msg/Rig", _definition(_RIG, _HEADER, _TIME))
-PICTURE = RecordedTopic(
-    6, "/aqualvs/picture", "sensor_msgs/msg/CompressedImage", _definition(_IMAGE, _HEADER, _TIME)
-)
-CHROMA = RecordedTopic(
-    7,
-    "/aqualvs/picture/chroma",
-    "sensor_msgs/msg/CompressedImage",
-    _definition(_IMAGE, _HEADER, _TIME),
-)
+
+def _topic(number: int, name: str, kind: str, own: str, *parts: tuple[str, str]) -> RecordedTopic:
+    """Return a topic with the definitions of its parts, in the format of ROS 2's recordings."""
+    line = 80 * "=" + "\n"
+    others = (f"{line}MSG: {part}\n{text}" for part, text in (_HEADER, _TIME, *parts))
+    return RecordedTopic(number, f"/aqualvs/{name}", kind, "".join([own, *others]))
+
+
+_RETURNS, _POINT_FIELD = ("aqualvs_msgs/Returns", _PEAKS), ("sensor_msgs/PointField", _FIELD)
+_PARTS = ("aqualvs_msgs/Part", _PART), ("aqualvs_msgs/Delay", _DELAY)
+POSTURE = _topic(1, "posture", "aqualvs_msgs/msg/Posture", _POSTURE)
+STRIPES = _topic(2, "stripes", "aqualvs_msgs/msg/Stripes", _STRIPES, _RETURNS)
+POINTS = _topic(3, "points", "sensor_msgs/msg/PointCloud2", _POINTS, _POINT_FIELD)
+HEALTH = _topic(4, "health", "aqualvs_msgs/msg/Health", _HEALTH, *_PARTS)
+RIG = _topic(5, "rig", "aqualvs_msgs/msg/Rig", _RIG)
+PICTURE = _topic(6, "picture", "sensor_msgs/msg/CompressedImage", _IMAGE)
+CHROMA = _topic(7, "picture/chroma", "sensor_msgs/msg/CompressedImage", _IMAGE)
 TOPICS = (POSTURE, STRIPES, POINTS, HEALTH, RIG, PICTURE, CHROMA)
 """All topics of a recording; the last two have no messages without pictures."""

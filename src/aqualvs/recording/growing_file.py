@@ -26,8 +26,7 @@ import contextlib
 import errno
 import os
 import zlib
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -35,6 +34,8 @@ from typing import Any, BinaryIO
 
 import pyarrow as pa
 
+from aqualvs import __version__
+from aqualvs.recording.encoding import TOPICS
 from aqualvs.sources import mcap_file
 from aqualvs.sources.mcap_file import DATA_END_BYTES, FOOTER_BYTES, HEAD_BYTES
 
@@ -49,12 +50,9 @@ class Chunk:
     length: int  # Of the record alone, in bytes.
     # By channel: offset of its message index from the chunk's start.
     index_offsets: dict[int, int]
-    # Log times of the first and the last message.
-    times_ns: tuple[int, int]
-    # Compressed and uncompressed size, in bytes.
-    sizes: tuple[int, int]
-    # By channel: number of messages.
-    counts: dict[int, int]
+    times_ns: tuple[int, int]  # Log times of the first and the last message.
+    sizes: tuple[int, int]  # Compressed and uncompressed size, in bytes.
+    counts: dict[int, int]  # By channel: number of messages.
 
     def index_at(self, at: int) -> bytes:
         """Return the index record for the summary, for the chunk at an offset in the file."""
@@ -95,19 +93,13 @@ class ChunkBuilder:
         times = [entries[end][0] for entries in self._entries.values() for end in (0, -1)]
         times_ns = (min(times), max(times))
         whole = mcap_file.chunk(*times_ns, len(raw), zlib.crc32(raw), _COMPRESSION, packed)
-        indexes = [mcap_file.message_index(*item) for item in self._entries.items()]
-        offsets, at = {}, len(whole)
-        for number, index in zip(self._entries, indexes, strict=True):
-            offsets[number] = at
-            at += len(index)
-        return Chunk(
-            b"".join((whole, *indexes)),
-            len(whole),
-            offsets,
-            times_ns,
-            (len(packed), len(raw)),
-            Counter({number: len(entries) for number, entries in self._entries.items()}),
-        )
+        parts, offsets, counts, at = [whole], {}, {}, len(whole)
+        for number, entries in self._entries.items():
+            offsets[number], counts[number] = at, len(entries)
+            parts.append(mcap_file.message_index(number, entries))
+            at += len(parts[-1])
+        sizes = len(packed), len(raw)
+        return Chunk(b"".join(parts), len(whole), offsets, times_ns, sizes, counts)
 
 
 @cache
@@ -129,42 +121,29 @@ _DATA_PER_SUMMARY = 8
 
 
 class GrowingFile:
-    """Writer of one file, chunk by chunk.
+    """Writer of one file with the topics of a recording, chunk by chunk.
+
+    Every method raises `OSError` if the system refuses a write. The file is then as before the
+    call, which may be repeated.
 
     Parameters
     ----------
     path : Path
-        Must not exist; the file appears as soon as it is readable.
-    front : bytes
-        Beginning of the file: magic, header, schemas and channels.
-    repeated : bytes
-        Schemas and channels again, for the summary.
-    n_schemas : int
-        Number of schemas.
-    channels : sequence of int
-        Ids of the channels.
+        The file appears there as soon as it is readable. `FileExistsError` if it exists.
     open_file : callable, optional
         Opens a path for unbuffered reading and writing; for tests.
-
-    Raises
-    ------
-    OSError
-        From every method, if the system refuses a write. The file is then as before the call, which
-        may be repeated. `FileExistsError` if the path exists.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        front: bytes,
-        repeated: bytes,
-        n_schemas: int,
-        channels: Sequence[int],
-        open_file: Callable[[Path], BinaryIO] | None = None,
-    ) -> None:
-        self._repeated, self._n_schemas = repeated, n_schemas
-        self._counts = dict.fromkeys(channels, 0)
+    def __init__(self, path: Path, open_file: Callable[[Path], BinaryIO] | None = None) -> None:
+        # For the beginning of the file and for the summary.
+        self._repeated = b"".join(
+            mcap_file.schema(topic.number, topic.kind, topic.definition)
+            + mcap_file.channel(topic.number, topic.number, topic.name)
+            for topic in TOPICS
+        )
+        # The profile identifies the messages as those of ROS 2, for rosbag2 and similar tools.
+        header = mcap_file.header("ros2", f"aqualvs {__version__}")
+        self._counts = {topic.number: 0 for topic in TOPICS}
         self._n_chunks = 0
         self._times_ns = (0, 0)
         self._indexes: list[bytes] = []
@@ -175,7 +154,7 @@ class GrowingFile:
         draft = path.with_name(path.name + ".part")
         self._file = (open_file or _open)(draft)
         try:
-            self._begin(front)
+            self._begin(mcap_file.MAGIC + header + self._repeated)
             _publish(draft, path)
         except BaseException:
             self._file.close()
@@ -321,7 +300,7 @@ class GrowingFile:
         return self._summary_bytes() * 5 // 4 + _INDEX_BYTES + 2 * _SPARE_BYTES
 
     def _statistics(self) -> bytes:
-        return mcap_file.statistics(self._n_schemas, self._n_chunks, self._times_ns, self._counts)
+        return mcap_file.statistics(len(TOPICS), self._n_chunks, self._times_ns, self._counts)
 
     def _fill(self, at: int) -> bytes:
         """Return a padding record if a record's head at `at` would cross a page boundary."""

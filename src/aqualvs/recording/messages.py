@@ -38,7 +38,7 @@ from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Posture, Reason, Refusal, deviations
 from aqualvs.scanning.scan import Frame, GyroRates, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.sources.base import Health, PartHealth, State
+from aqualvs.sources.base import Health, State
 from aqualvs.yamlfile import rig_text
 
 FRAME_ID = "dome"
@@ -161,7 +161,11 @@ def health_message(health: Health, stamp_ns: int) -> bytes:
     parts += [("output", part) for part in health.outputs]
     to.numbers("I", len(parts))
     for kind, part in parts:
-        _put_part(to, kind, part)
+        to.text(kind)
+        to.text(part.name)
+        to.numbers("B", _STATES[part.state])
+        to.text(part.detail)
+        to.numbers("q", part.n_dropped)
     to.numbers("I", len(health.delays))
     for delay in health.delays:
         to.text(delay.name)
@@ -251,14 +255,6 @@ def _filtered_values(filtered: FilteredPosture | None) -> list[float]:
     ]
 
 
-def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
-    to.text(kind)
-    to.text(part.name)
-    to.numbers("B", _STATES[part.state])
-    to.text(part.detail)
-    to.numbers("q", part.n_dropped)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecorderOptions:
     """Options of a recording: its content, and how often it is written."""
@@ -304,7 +300,9 @@ class SampleEncoder:
         yield from self.rig_messages(sample.rig, stamp_ns)
         if sample.frame is not None:
             yield from self._pictures(sample.frame, stamp_ns)
-        if not _is_silence(sample):
+        posture = sample.scan.posture
+        # A silent stream has no frame.
+        if posture or posture.reason is not Reason.NO_FRAMES:
             yield STRIPES, stripes_message(sample, stamp_ns)
         yield POSTURE, posture_message(sample, stamp_ns)
         if len(sample.scan.points) and self._points_due.at(stamp_ns):
@@ -339,11 +337,9 @@ class SampleEncoder:
             yield RIG, rig_message(self._rig_texts, stamp_ns)
 
     def _is_new(self, rig: Rig) -> bool:
-        if rig is self._rig:
-            return False
-        return self._exact != rig_exact(
-            rig if self._rig is None else rig.in_water(self._rig.n_water)
-        )
+        if rig is self._rig or self._rig is None:
+            return self._rig is None
+        return self._exact != rig_exact(rig.in_water(self._rig.n_water))
 
     def _pictures(self, frame: Frame, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
         kind = self._options.pictures
@@ -393,9 +389,3 @@ class RateLimit:
             return False
         self._from_ns = stamp_ns + self._every_ns
         return True
-
-
-def _is_silence(sample: LiveSample) -> bool:
-    """Return whether a sample reports a silent stream instead of a frame."""
-    posture = sample.scan.posture
-    return isinstance(posture, Refusal) and posture.reason is Reason.NO_FRAMES

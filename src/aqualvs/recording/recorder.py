@@ -6,6 +6,7 @@ during the run.
 """
 
 import errno
+import itertools
 import threading
 import time
 from collections import deque
@@ -14,13 +15,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from aqualvs import __version__
 from aqualvs.errors import OutputError
-from aqualvs.recording.encoding import RIG, STRIPES, TOPICS, RecordedTopic
+from aqualvs.recording.encoding import RIG, STRIPES, RecordedTopic
 from aqualvs.recording.growing_file import Chunk, ChunkBuilder, GrowingFile
 from aqualvs.recording.messages import RecordClock, RecorderOptions, SampleEncoder
 from aqualvs.recording.sample import LiveSample
-from aqualvs.sources import mcap_file
 from aqualvs.sources.base import PartHealth, State
 
 # Size of uncompressed messages at which a chunk is written before it is due.
@@ -87,7 +86,7 @@ class Recording:
 
     def __init__(self, path: Path, options: RecorderOptions) -> None:
         self._chunks = SampleChunks(options)
-        self._file = recording_file(path)
+        self._file = GrowingFile(path)
         self._closed = False
 
     def write(self, sample: LiveSample) -> None:
@@ -114,27 +113,6 @@ class Recording:
             self._file.append(messages.seal())
 
 
-def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = None) -> GrowingFile:
-    """Create a file with the topics of a recording.
-
-    Raises `OSError` as `GrowingFile` does.
-    """
-    repeated = b"".join(
-        mcap_file.schema(topic.number, topic.kind, topic.definition)
-        + mcap_file.channel(topic.number, topic.number, topic.name)
-        for topic in TOPICS
-    )
-    return GrowingFile(
-        path,
-        # The profile identifies the messages as those of ROS 2, for rosbag2 and similar tools.
-        front=mcap_file.MAGIC + mcap_file.header("ros2", f"aqualvs {__version__}") + repeated,
-        repeated=repeated,
-        n_schemas=len(TOPICS),
-        channels=[topic.number for topic in TOPICS],
-        open_file=open_file,
-    )
-
-
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 # Period of retries after a failed write, and of checks for a chunk that is due.
 _RETRY_S, _CHECK_S = 2.0, 0.25
@@ -145,18 +123,9 @@ _TIMEOUT_S = 4.0
 class Recorder:
     """Writer of samples in its own thread, to a file that is readable at any time.
 
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-    open_file : callable, optional
-        As in `GrowingFile`; for tests.
-
-    Raises
-    ------
-    OutputError
-        If the file exists or cannot be created. `health` reports later faults: data that cannot be
-        written wait in memory, up to the limit of the options, and are tried again.
+    `path`: must not exist. `open_file`: as in `GrowingFile`; for tests. Raises `OutputError` if the
+    file exists or cannot be created. `health` reports later faults: data that cannot be written
+    wait in memory, up to the limit of the options, and are tried again.
     """
 
     name = "recorder"
@@ -170,7 +139,12 @@ class Recorder:
         self.path = path
         self._options = options or RecorderOptions()
         self._chunks = SampleChunks(self._options)
-        self._file = _create_file(path, open_file)
+        try:
+            self._file = GrowingFile(path, open_file)
+        except FileExistsError:
+            raise OutputError(f"{path}: exists; give the recording another name") from None
+        except OSError as fault:
+            raise OutputError(f"{path}: {_fault_text(fault)}; choose another place") from fault
         self._changed = threading.Condition()
         self._waiting: deque[tuple[ChunkBuilder, int]] = deque()
         self._waiting_bytes = 0
@@ -283,15 +257,6 @@ class Recorder:
             return self._closing or self._changed.wait_for(lambda: self._closing, _RETRY_S)
 
 
-def _create_file(path: Path, open_file: Callable[[Path], BinaryIO] | None) -> GrowingFile:
-    try:
-        return recording_file(path, open_file)
-    except FileExistsError:
-        raise OutputError(f"{path}: exists; give the recording another name") from None
-    except OSError as fault:
-        raise OutputError(f"{path}: {_fault_text(fault)}; choose another place") from fault
-
-
 def _fault_text(fault: OSError) -> str:
     if fault.errno in _FULL:
         return "the disk is full"
@@ -326,39 +291,24 @@ class RecorderSwitch:
         """Time since the last recording was started."""
         return time.monotonic() - self._began_s
 
-    def start(self, path: Path | None = None) -> Path:
-        """Start a recording, unless one is running.
+    def start(self) -> Path:
+        """Start a recording, unless one is running; return its file, named by the time (UTC).
 
-        Parameters
-        ----------
-        path : Path or None
-            File to write, which must not exist; None names it by the time (UTC).
-
-        Returns
-        -------
-        path : Path
-            File that is being written.
-
-        Raises
-        ------
-        OutputError
-            If the file cannot be created.
+        Raises `OutputError` if the file cannot be created.
         """
         with self._lock:
             if self._recorder is None:
-                self._recorder = Recorder(path or self._free_path(), self._options)
+                self._recorder = Recorder(self._free_path(), self._options)
                 self._began_s = time.monotonic()
             return self._recorder.path
 
-    def stop(self) -> Path | None:
-        """Close the file and return its path; None if there is no recording."""
+    def stop(self) -> None:
+        """Close the file; does nothing if there is no recording."""
         with self._lock:
             recorder, self._recorder = self._recorder, None
-        if recorder is None:
-            return None
-        recorder.close()
-        self._last = recorder.health()
-        return recorder.path
+        if recorder is not None:
+            recorder.close()
+            self._last = recorder.health()
 
     def send(self, sample: LiveSample) -> None:
         """Record a sample, if recording is on."""
@@ -374,7 +324,7 @@ class RecorderSwitch:
         return self._last or PartHealth(self.name, State.OFF, "not recording")
 
     def close(self) -> None:
-        """Close the file; further calls do nothing."""
+        """Stop; further calls do nothing."""
         self.stop()
 
     def _free_path(self) -> Path:
@@ -386,8 +336,6 @@ class RecorderSwitch:
             raise OutputError(
                 f"{self._folder}: cannot be made ({fault.strerror}); choose another folder"
             ) from fault
-        path, n = self._folder / f"{stem}.mcap", 1
-        while path.exists():
-            n += 1
-            path = self._folder / f"{stem}_{n}.mcap"
-        return path
+        names = itertools.chain([stem], (f"{stem}_{n}" for n in itertools.count(2)))
+        paths = (self._folder / f"{name}.mcap" for name in names)
+        return next(path for path in paths if not path.exists())

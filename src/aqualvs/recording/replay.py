@@ -33,16 +33,12 @@ class RecordedFrame:
     # As in `Frame`.
     index: int
     time_s: float
-    # Refractive index of the water used for this frame.
-    n_water: float
-    # Detected stripes.
-    peaks: dict[SearchAxis, StripePeaks]
-    # Reason if the frame was not measured; None if it was.
-    refusal: Refusal | None
-    # Rates by the vehicle's gyros, if known.
-    turning: GyroRates | None
-    # None if there is none, or pictures are not decoded.
-    picture: Frame | None
+
+    n_water: float  # Refractive index of the water used for this frame.
+    peaks: dict[SearchAxis, StripePeaks]  # Detected stripes.
+    refusal: Refusal | None  # Reason if the frame was not measured; None if it was.
+    turning: GyroRates | None  # Rates by the vehicle's gyros, if known.
+    picture: Frame | None  # None if there is none, or pictures are not decoded.
 
 
 class DiveRecording:
@@ -126,14 +122,13 @@ class DiveRecording:
     def _frame(self, parts: dict[str, StoredMessage]) -> RecordedFrame:
         stripes = parts[STRIPES.name]
         try:
-            index, time_s, n_water, peaks, refusal, turning = stripes_of(stripes.data)
-            picture = _picture(index, time_s, parts)
+            found = stripes_of(stripes.data)
+            return RecordedFrame(*found, _picture(found[0], found[1], parts))
         except (ValueError, AqualvsError) as fault:
             raise SourceError(
                 f"{self.path}: a message cannot be understood ({fault}); "
                 "was it written by a later version?"
             ) from fault
-        return RecordedFrame(index, time_s, n_water, peaks, refusal, turning, picture)
 
 
 def is_recording(path: Path) -> bool:

@@ -108,13 +108,6 @@ class RerunLog(Closing):
             marks = self._rr.Points2D(scan.points.pixels, class_ids=scan.points.label, radii=-1.5)
             self._stream.log(f"{_PICTURE}/points", marks)
 
-    def flush(self, timeout_s: float) -> None:
-        """Wait until everything has been sent.
-
-        Raises `RuntimeError` after the timeout.
-        """
-        self._stream.flush(timeout_sec=timeout_s)
-
     def close(self) -> None:
         """Finish the file, or disconnect from the viewer; further calls do nothing."""
         if not self._closed:

@@ -117,18 +117,9 @@ def chunk_index(
 ) -> bytes:
     """Return where a chunk is.
 
-    Parameters
-    ----------
-    times_ns : (int, int)
-        Of its first and last message.
-    at, length : int
-        Of the chunk's record in the file.
-    index_offsets : mapping
-        Where each channel's message index is in the file.
-    index_length : int
-        Of all these indexes together.
-    sizes : (int, int)
-        Compressed and raw.
+    `times_ns`: of its first and last message. `at`, `length`: of its record in the file.
+    `index_offsets`: where each channel's message index is in the file. `index_length`: of all these
+    together. `sizes`: compressed and raw.
     """
     offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
     return record(
@@ -146,12 +137,8 @@ def statistics(
 ) -> bytes:
     """Return the counts of a file; of the same length for the same channels.
 
-    Parameters
-    ----------
-    times_ns : (int, int)
-        Of the first and the last message.
-    counts : mapping
-        Number of messages of every channel, also of those without.
+    `times_ns`: of the first and the last message. `counts`: messages of every channel, also of
+    those without.
     """
     of_channel = b"".join(struct.pack("<HQ", *item) for item in counts.items())
     numbers = struct.pack(
@@ -192,7 +179,6 @@ class StoredMessage:
 
     topic: str
     log_ns: int
-    publish_ns: int
     data: bytes
 
 
@@ -203,12 +189,9 @@ class _Listing:
     channels: list[tuple[int, str]] = field(default_factory=list)  # Numbers and topics.
     # From a chunk's place in the file to the length of its record; None where not known.
     chunks: dict[int, int | None] = field(default_factory=dict)
-    # Messages by channel.
-    counts: dict[int, int] | None = None
-    # As the statistics have it.
-    n_chunks: int | None = None
-    # Whether it was read to its end.
-    whole: bool = False
+    counts: dict[int, int] | None = None  # Messages by channel.
+    n_chunks: int | None = None  # As the statistics have it.
+    whole: bool = False  # Whether it was read to its end.
 
 
 class McapFile:
@@ -236,7 +219,10 @@ class McapFile:
             sound = _is_sound(file, summary)
             if not sound:
                 front = _front(file, size, only_channels=False)
-        self._topics = _merged_topics(front, summary)
+        # Where the ends give a channel two names both count: a damaged name matches no request.
+        self._names = [
+            *dict.fromkeys(pair for one in (front, summary) for pair in _consistent(one.channels))
+        ]
         self._counts = summary.counts if sound else None
         # A file that was read to its end needs no summary, which may itself be damaged.
         listed = summary.chunks if sound else front.chunks
@@ -252,25 +238,20 @@ class McapFile:
     @property
     def topics(self) -> tuple[str, ...]:
         """Topics that the file knows, also those without messages."""
-        return tuple(dict.fromkeys(name for names in self._topics.values() for name in names))
+        return tuple(dict.fromkeys(name for _, name in self._names))
 
     def count(self, topic: str) -> int | None:
         """Return the number of messages of a topic; None where the file does not say."""
         if self._counts is None:
             return None
-        return sum(n for number, n in self._counts.items() if topic in self._topics.get(number, ()))
+        return sum(n for number, n in self._counts.items() if (number, topic) in self._names)
 
     def messages(self, topics: Collection[str]) -> Iterator[StoredMessage]:
         """Yield the messages of some topics in the order of the file.
 
         Raises `SourceError` if the file cannot be read any more.
         """
-        wanted = {
-            number: name
-            for number, names in self._topics.items()
-            for name in names
-            if name in topics
-        }
+        wanted = {number: name for number, name in self._names if name in topics}
         with self._opened() as file:
             for at in self._chunks:
                 raw = _chunk_at(file, at)
@@ -333,28 +314,18 @@ def _front(file: BinaryIO, size: int, *, only_channels: bool) -> _Listing:
 
 def _is_sound(file: BinaryIO, summary: _Listing) -> bool:
     """Return whether a summary is whole and agrees with itself and with the chunks."""
-    numbers = [number for number, _ in summary.channels]
     if not summary.whole or summary.n_chunks != len(summary.chunks) or not summary.chunks:
         return False
-    if len(set(numbers)) < len(numbers) or summary.counts is None:
+    if summary.channels != _consistent(summary.channels) or summary.counts is None:
         return False
     return all(
         _record_head(file, at) == (Op.CHUNK, length) for at, length in summary.chunks.items()
     )
 
 
-def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, ...]]:
-    """Return the topics of every channel by both ends; one end that contradicts itself is left out.
-
-    Where the ends give a channel two names both count: a damaged name matches no request.
-    """
-    found: dict[int, tuple[str, ...]] = {}
-    for one in (front, summary):
-        numbers = [number for number, _ in one.channels]
-        if len(set(numbers)) == len(numbers):
-            for number, name in one.channels:
-                found[number] = tuple(dict.fromkeys((*found.get(number, ()), name)))
-    return found
+def _consistent(channels: list[tuple[int, str]]) -> list[tuple[int, str]]:
+    """Return the channels of one end of a file; none if it gives a number twice."""
+    return channels if len(dict(channels)) == len(channels) else []
 
 
 def _note(found: _Listing, kind: int, content: bytes) -> None:
@@ -379,11 +350,11 @@ def _records(file: BinaryIO, at: int) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of the records from a place on; paddings without their content."""
     while (first := _record_head(file, at)) is not None:
         kind, length = first
-        if kind < Op.PADDING and length > _MAX_SUMMARY_BYTES:
-            return
-        content = b"" if kind >= Op.PADDING else file.read(length)
-        if kind < Op.PADDING and len(content) < length:
-            return
+        content = b""
+        if kind < Op.PADDING:
+            content = file.read(min(length, _MAX_SUMMARY_BYTES))
+            if len(content) < length:
+                return
         yield kind, content
         at += HEAD_BYTES + length
 
@@ -442,7 +413,7 @@ def _messages(raw: bytes, topics: dict[int, str]) -> Iterator[StoredMessage]:
         kind, length = struct.unpack_from("<BQ", raw, at)
         start, at = at + HEAD_BYTES, at + HEAD_BYTES + length
         if kind == Op.MESSAGE:
-            number, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(raw, start)
+            number, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(raw, start)
             if number in topics:
                 data = raw[start + _MESSAGE_HEAD.size : at]
-                yield StoredMessage(topics[number], log_ns, publish_ns, data)
+                yield StoredMessage(topics[number], log_ns, data)
