@@ -27,10 +27,10 @@ from aqualvs.sources.image_messages import (
     Logged,
     MessageSource,
     choose_topic,
+    holds_images,
     image_of_json,
     image_of_protobuf,
     image_of_ros,
-    kind_of_schema,
 )
 from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, Op, decompressed
 from aqualvs.special_files import refuse_special
@@ -47,19 +47,10 @@ _REMEDY = "check it with ros2 bag info or rosbag reindex"
 def open_bag(path: Path, topic: str | None = None) -> MessageSource:
     """Open the images of a ROS bag.
 
-    Parameters
-    ----------
-    path : Path
-        A `.bag` file, a folder with `metadata.yaml`, or a `.db3` file within such a folder.
-    topic : str or None
-        Needed where several topics have images.
-
-    Raises
-    ------
-    SourceError
-        If the bag cannot be read or has no images.
-    OptionError
-        If the topic is missing or wrong, or a package is missing.
+    `path`: a `.bag` file, a folder with `metadata.yaml`, or a `.db3` file within such a folder.
+    `topic`: needed where several topics have images. Raises `SourceError` if the bag cannot be read
+    or has no images. Raises `OptionError` if the topic is missing or wrong, or a package is
+    missing.
     """
     _require("rosbags.highlevel", path, "ROS bags")
     folder = path.parent if path.suffix.lower() == ".db3" else path
@@ -97,7 +88,7 @@ def _image_topics(path: Path) -> list[ImageTopic]:
     counts: dict[str, int] = {}
     with _opened(path) as reader:
         for connection in reader.connections:
-            if kind_of_schema(connection.msgtype):
+            if holds_images(connection.msgtype):
                 counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
     return [ImageTopic(name, n) for name, n in counts.items()]
 
@@ -245,7 +236,7 @@ def _mcap_image_topics(path: Path) -> list[ImageTopic]:
             ImageTopic(channel.topic, counts.get(channel.id))
             for channel in summary.channels.values()
             if channel.schema_id in summary.schemas
-            and kind_of_schema(summary.schemas[channel.schema_id].name)
+            and holds_images(summary.schemas[channel.schema_id].name)
         ]
 
 
@@ -255,7 +246,7 @@ def _topics_by_reading(path: Path, stream: "_Bounded") -> list[ImageTopic]:
     try:
         with _faults_in_one_line(path):
             for schema, channel, _ in _messages_in_order(stream, None, only_channels=True):
-                if schema is not None and kind_of_schema(schema.name):
+                if schema is not None and holds_images(schema.name):
                     found[channel.topic] = ImageTopic(channel.topic, None)
     except SourceError:
         if not found:

@@ -109,12 +109,6 @@ def _bgr_of(frame: Frame) -> ImagePlane:
     return np.ascontiguousarray(image[:height, :width], dtype=np.uint8)
 
 
-_PLANAR = frozenset({"yuv420p", "yuvj420p"})
-_SEMI_PLANAR = frozenset({"nv12"})
-_GREY = frozenset({"gray"})
-_FULL_RANGE = int(ColorRange.JPEG)
-
-
 def planes_of(picture: VideoFrame) -> Planes:
     """Return luma and chroma of a decoded picture.
 
@@ -135,16 +129,16 @@ def planes_of(picture: VideoFrame) -> Planes:
     predicts later pictures from it.
     """
     kind = picture.format.name
-    if kind in _PLANAR:
+    if kind in ("yuv420p", "yuvj420p"):
         y, u, v = picture.planes
         return _view(y), (_view(u), _view(v))
-    if kind in _SEMI_PLANAR:
+    if kind == "nv12":
         y, uv = picture.planes
         return _view(y), (_view(uv, first=0, step=2), _view(uv, first=1, step=2))
-    if kind in _GREY:
+    if kind == "gray":
         return _view(picture.planes[0]), None
     # In the same range, so that luma keeps its values.
-    full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
+    full = kind.startswith("yuvj") or picture.color_range == int(ColorRange.JPEG)
     return planes_of(picture.reformat(format="yuvj420p" if full else "yuv420p"))
 
 
@@ -158,22 +152,17 @@ def _view(plane: VideoPlane, *, first: int = 0, step: int = 1) -> ImagePlane:
 
 
 def frame_of(index: int, time_s: float, picture: VideoFrame) -> Frame:
-    """Return the frame that a decoded picture makes.
-
-    `picture`: as `planes_of` takes it.
-    """
+    """Return the frame that a decoded picture makes, as `planes_of` takes it."""
     luma, chroma = planes_of(picture)
     return Frame(index, time_s, luma, chroma, is_interlaced=bool(picture.interlaced_frame))
 
 
 def packet_with(data: bytes) -> "Packet[VideoStream]":
-    """Return a packet with a copy of `data`.
+    """Return a packet with a copy of one coded picture.
 
     Decoders read a few dozen bytes beyond a packet's end and count on zeros there
     (AV_INPUT_BUFFER_PADDING_SIZE of FFmpeg). Memory that FFmpeg allocates has them; Python's bytes
     end where they end, so that an intact picture may count as damaged.
-
-    `data`: one coded picture.
     """
     packet = cast("Packet[VideoStream]", Packet(len(data)))
     packet.update(data)

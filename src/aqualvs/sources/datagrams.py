@@ -145,19 +145,8 @@ def transport_content(datagram: bytes) -> bytes | None:
 class Datagrams:
     """Receiver on a UDP port, and queue of what comes; its thread empties the system's buffer.
 
-    Parameters
-    ----------
-    address : UdpAddress
-        Where to listen.
-    ended : Event
-        Set when the feed ends.
-    reception : Reception
-        Told of what cannot be used.
-
-    Raises
-    ------
-    OSError
-        If the system refuses: the port is taken, the address is none of this machine.
+    `ended`: set when the feed ends. `reception`: told of what cannot be used. Raises `OSError` if
+    the system refuses: the port is taken, the address is none of this machine.
     """
 
     def __init__(self, address: UdpAddress, ended: threading.Event, reception: Reception) -> None:
@@ -195,10 +184,7 @@ class Datagrams:
         return None
 
     def is_late(self, datagram: Datagram) -> bool:
-        """Return whether decoding lags too far behind; if so, drop the waiting datagrams.
-
-        `datagram`: the oldest.
-        """
+        """Return whether decoding the oldest lags too far behind; if so, drop what waits."""
         if time.monotonic() - datagram.arrival < _MAX_LAG_S:
             return False
         for _ in range(self._waiting.qsize()):
@@ -206,10 +192,7 @@ class Datagrams:
         return True
 
     def is_foreign(self, datagram: Datagram, *, fits: bool) -> bool:
-        """Return whether the sender has changed to another kind.
-
-        `fits`: whether it is of the kind that is being read.
-        """
+        """Return whether the sender has changed its kind; `fits`: whether this one is as before."""
         self._n_foreign = 0 if fits else self._n_foreign + 1
         if self._n_foreign < MAX_FOREIGN:
             return False

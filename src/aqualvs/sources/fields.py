@@ -44,20 +44,11 @@ def frames_of(pictures: Iterable[Frame], shutter: Shutter) -> Iterator[Frame]:
 
 
 def field_of(picture: Frame, field: Field) -> Frame:
-    """Return one field of a picture.
+    """Return one field of a whole picture: a view of its luma, with its index and time.
 
-    Parameters
-    ----------
-    picture : Frame
-        A whole one. Where its stream does not say that it is interlaced, each row of its chroma is
-        of both fields: a field's chroma is the mean of two such rows, which smears the colour of
-        what moves, not its luma.
-    field : {"top", "bottom"}
-
-    Returns
-    -------
-    Frame
-        A view of the luma, with index and time of the picture.
+    Where the picture's stream does not say that it is interlaced, each row of its chroma is of both
+    fields: a field's chroma is the mean of two such rows, which smears the colour of what moves,
+    not its luma.
     """
     luma = _rows(picture.luma, field, len(picture.luma) // 2)
     chroma = picture.chroma
@@ -116,12 +107,7 @@ def frames_in(span: Span, shutter: Shutter) -> tuple[int, int]:
 class FieldSource(Closing):
     """Source of the fields of another source's pictures; satisfies `FrameSource`.
 
-    Parameters
-    ----------
-    pictures : FrameSource
-        Closed with this one.
-    shutter : Shutter
-        Interlaced.
+    `pictures`: closed with this one. `shutter`: interlaced.
     """
 
     def __init__(self, pictures: FrameSource, shutter: Shutter) -> None:
@@ -143,8 +129,6 @@ class FrameFeed:
     """Feed of a camera's frames: another feed's pictures, or their fields; satisfies `Feed`.
 
     Its health warns where the pictures contradict the rig's shutter.
-
-    `shutter`: of the rig.
     """
 
     def __init__(self, pictures: Feed, shutter: Shutter) -> None:
@@ -212,10 +196,8 @@ class FieldEvidence:
     combed: float  # Mean share of combed pixels.
     # The same if the bottom rows came from the next picture: what fields would show at most.
     woven: float
-    # The same if the top rows did.
-    woven_top: float = 0.0
-    # As the stream states it, if it does.
-    first_field: Field | None = None
+    woven_top: float = 0.0  # The same if the top rows did.
+    first_field: Field | None = None  # As the stream states it, if it does.
 
     @classmethod
     def of(
@@ -247,8 +229,7 @@ class FieldEvidence:
     @property
     def are_fields(self) -> bool:
         """Whether the pictures are combed, or marked and nothing contradicts it."""
-        is_combed = self.combed > _COMBED_SHARE and not self.are_whole
-        return is_combed or (self.is_marked and not self.are_whole)
+        return (self.is_marked or self.combed > _COMBED_SHARE) and not self.are_whole
 
     @property
     def first_by_motion(self) -> Field | None:

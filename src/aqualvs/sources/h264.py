@@ -49,12 +49,8 @@ _CODECS = {
 def unit_reader(codec: str, extradata: bytes) -> UnitReader | None:
     """Return the function that reads a stream's packets; None for a codec without such units.
 
-    Parameters
-    ----------
-    codec : str
-        As FFmpeg names it.
-    extradata : bytes
-        Of the stream; states whether units begin with their length or with a start code.
+    `codec`: as FFmpeg names it. `extradata`: of the stream; states whether units begin with their
+    length or with a start code.
     """
     found = _CODECS.get(codec)
     if found is None:
@@ -133,16 +129,8 @@ class FrameNumbers:
     def is_gap_before(self, data: bytes) -> bool:
         """Return whether a reference picture is missing before this one.
 
-        Parameters
-        ----------
-        data : bytes
-            All units of a picture, as a byte stream (annex B).
-
-        Returns
-        -------
-        gap : bool
-            False also where that is unknown: before a parameter set, in streams that leave
-            numbers out on purpose.
+        False also where that is unknown: before a parameter set, in streams that leave numbers out
+        on purpose. `data`: all units of a picture, as a byte stream (annex B).
         """
         for unit in _heads(data):
             if len(unit) < 4:
@@ -190,36 +178,24 @@ class FieldPairs:
             self.is_second(extradata)
 
     def is_second(self, packet: bytes | memoryview) -> bool:
-        """Return whether a packet completes the picture of the packet before it.
-
-        `packet`: the next one of the stream, in the order of decoding.
-        """
+        """Return whether the next packet, in the order of decoding, completes the last picture."""
         for unit in _heads(packet, self._n_length):
             kind = unit[0] & 31
             if kind == NalType.SPS:
                 self._form = _slice_form(unit)
             elif kind in (NalType.SLICE, NalType.IDR):
-                if kind == NalType.IDR:
-                    self._first = None  # No second field is an IDR picture.
-                return self._pairs(None if self._form is None else self._form.field(unit))
-        return False
-
-    def _pairs(self, field: tuple[int, int] | None) -> bool:
-        """Return whether a field, by frame number and parity, goes with the one before it."""
-        first = self._first
-        # 7.4.1.2.4: both fields of a picture have one frame number, and differ in parity.
-        if first is not None and field == (first[0], 1 - first[1]):
-            self._first = None
-            return True
-        self._first = field
+                first = None if kind == NalType.IDR else self._first
+                field = None if self._form is None else self._form.field(unit)
+                # 7.4.1.2.4: both fields of a picture have one frame number, and differ in parity;
+                # the second one is no IDR picture.
+                is_second = first is not None and field == (first[0], 1 - first[1])
+                self._first = None if is_second else field
+                return is_second
         return False
 
 
 def field_pairs(codec: str, extradata: bytes | None) -> FieldPairs | None:
-    """Return the detector of second fields for a stream; None if it is not H.264.
-
-    `codec`: name that FFmpeg gives the codec.
-    """
+    """Return the detector of second fields for a stream; None if it is not H.264."""
     return FieldPairs(extradata or b"") if codec == "h264" else None
 
 

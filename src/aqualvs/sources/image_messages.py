@@ -27,8 +27,9 @@ from aqualvs.sources.live_frames import LiveDecoder
 VIDEO_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": "vp9"}
 """FFmpeg's names of the codecs of `CompressedVideo`."""
 
-_GREY = frozenset({"mono8", "8uc1"})
-_GREY_16 = frozenset({"mono16", "16uc1"})
+_GREY = {"mono8": 1, "8uc1": 1, "mono16": 2, "16uc1": 2}
+"""Bytes of a grey pixel."""
+
 _TO_BGR = {
     "bgr8": (3, None),
     "8uc3": (3, None),
@@ -46,7 +47,12 @@ _TO_BGR = {
 _PACKED_422 = {"yuv422_yuy2": 0, "yuyv": 0, "yuv422": 1, "uyvy": 1}
 """Position of luma among the bytes of two pixels; ROS's `yuv422` is UYVY."""
 
-ENCODINGS = tuple(sorted({*_GREY, *_GREY_16, *_TO_BGR, *_PACKED_422}))
+_FORMATS = {
+    **_TO_BGR,
+    **{name: (n_bytes, None) for name, n_bytes in _GREY.items()},
+    **dict.fromkeys(_PACKED_422, (2, None)),
+}
+ENCODINGS = tuple(sorted(_FORMATS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,32 +75,23 @@ class ImageMessage:
 
 
 def planes_of_message(message: ImageMessage) -> Planes | None:
-    """Return luma and chroma of a picture, or None if it cannot be decoded.
+    """Return luma and chroma of a picture, not of a video, or None if it cannot be decoded.
 
-    Parameters
-    ----------
-    message : ImageMessage
-        Not of a video.
-
-    Returns
-    -------
-    luma, chroma
-        As `planes_of_image`; luma and chroma of a packed 4:2:2 picture keep their values.
+    They are as from `planes_of_image`; those of a packed 4:2:2 picture keep their values.
     """
     if message.size_px is None:
         return _decompressed(message.data)
     name = message.encoding.lower()
-    if name in _GREY:
-        rows = _rows(message, 1)
-        return None if rows is None else planes_of_image(rows[..., 0].copy())
-    if name in _GREY_16:
-        return _high_bytes(message)
-    if name in _PACKED_422:
-        return _packed(message, _PACKED_422[name])
-    n_channels, conversion = _TO_BGR.get(name, (0, None))
-    rows = _rows(message, n_channels) if n_channels else None
+    n_bytes, conversion = _FORMATS.get(name, (0, None))
+    rows = _rows(message, n_bytes) if n_bytes else None
     if rows is None:
         return None
+    if name in _PACKED_422:
+        return _unpacked(rows, _PACKED_422[name])
+    if name in _GREY:
+        # Of 16 bits, the high ones.
+        at = int(n_bytes == 2 and not message.is_big_endian)
+        return planes_of_image(rows[..., at].copy())
     image = np.ascontiguousarray(rows)
     if conversion is not None:
         image = cast("NDArray[np.uint8]", cv2.cvtColor(image, conversion))
@@ -127,17 +124,9 @@ def _rows(message: ImageMessage, n_bytes: int) -> NDArray[np.uint8] | None:
     )
 
 
-def _high_bytes(message: ImageMessage) -> Planes | None:
-    rows = _rows(message, 2)
-    if rows is None:
-        return None
-    return planes_of_image(rows[..., 0 if message.is_big_endian else 1].copy())
-
-
-def _packed(message: ImageMessage, first: int) -> Planes | None:
+def _unpacked(pixels: NDArray[np.uint8], first: int) -> Planes | None:
     """Take 4:2:2 apart; chroma of two rows is averaged."""
-    pixels = _rows(message, 2)
-    if pixels is None or pixels.shape[0] % 2 or pixels.shape[1] % 2:
+    if pixels.shape[0] % 2 or pixels.shape[1] % 2:
         return None
     luma = np.ascontiguousarray(pixels[..., first])
     both = pixels[..., 1 - first].astype(np.uint16)
@@ -148,37 +137,24 @@ def _packed(message: ImageMessage, first: int) -> Planes | None:
     return luma, chroma
 
 
-_KINDS = {
-    "sensor_msgs/Image": "Image",
-    "sensor_msgs/CompressedImage": "CompressedImage",
-    "foxglove.RawImage": "RawImage",
-    "foxglove.CompressedImage": "CompressedImage",
-    "foxglove.CompressedVideo": "CompressedImage",
-    "foxglove_msgs/RawImage": "RawImage",
-    "foxglove_msgs/CompressedImage": "CompressedImage",
-    "foxglove_msgs/CompressedVideo": "CompressedImage",
+_SCHEMAS = frozenset(
+    {"sensor_msgs/Image", "sensor_msgs/CompressedImage"}.union(
+        f"{package}{kind}"
+        for package in ("foxglove.", "foxglove_msgs/")
+        for kind in ("RawImage", "CompressedImage", "CompressedVideo")
+    )
+)
+# Field numbers in Foxglove's Protobuf schemas: of the encoding or format, and of the data.
+_PROTOBUF_FIELDS = {
+    "foxglove.RawImage": (4, 6),
+    "foxglove.CompressedImage": (3, 2),
+    "foxglove.CompressedVideo": (4, 3),
 }
-"""Foxglove's compressed video and its compressed image have the same fields."""
-
-_TIME, _FORMAT = 1, {"foxglove.CompressedImage": 3, "foxglove.CompressedVideo": 4}
-_DATA = {"foxglove.CompressedImage": 2, "foxglove.CompressedVideo": 3}
-"""Field numbers in Foxglove's Protobuf schemas."""
 
 
-def kind_of_schema(name: str) -> str | None:
-    """Return the kind of image of a schema, or None.
-
-    Parameters
-    ----------
-    name : str
-        `sensor_msgs/msg/Image`, `foxglove.CompressedVideo` and the like.
-
-    Returns
-    -------
-    kind : str or None
-        "Image", "RawImage" or "CompressedImage".
-    """
-    return _KINDS.get(name.replace("/msg/", "/"))
+def holds_images(schema: str) -> bool:
+    """Return whether messages of a schema, such as `sensor_msgs/msg/Image`, are read here."""
+    return schema.replace("/msg/", "/") in _SCHEMAS
 
 
 def image_of_ros(message: Any) -> ImageMessage:
@@ -235,18 +211,18 @@ def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
 
     def read(content: bytes) -> ImageMessage:
         fields = protobuf_fields(content)
-        stamp_ns = _protobuf_time(_bytes(fields.get(_TIME, b"")))
+        stamp = protobuf_fields(_bytes(fields, 1))
+        encoding_at, data_at = _PROTOBUF_FIELDS[schema]
+        encoding = _bytes(fields, encoding_at).decode("utf-8", "replace")
+        found = ImageMessage(
+            stamp_ns=_int(stamp, 1) * 1_000_000_000 + _int(stamp, 2),
+            encoding=encoding,
+            data=_bytes(fields, data_at),
+        )
         if schema == "foxglove.RawImage":
-            return ImageMessage(
-                stamp_ns=stamp_ns,
-                encoding=_bytes(fields.get(4, b"")).decode("utf-8", "replace"),
-                data=_bytes(fields.get(6, b"")),
-                size_px=(_int(fields.get(2, 0)), _int(fields.get(3, 0))),
-                step=_int(fields.get(5, 0)),
-            )
-        encoding = _bytes(fields.get(_FORMAT[schema], b"")).decode("utf-8", "replace")
-        data = _bytes(fields.get(_DATA[schema], b""))
-        return ImageMessage(stamp_ns=stamp_ns, encoding=_still(encoding), data=data)
+            size_px = _int(fields, 2), _int(fields, 3)
+            return replace(found, size_px=size_px, step=_int(fields, 5))
+        return replace(found, encoding=_still(encoding))
 
     return read
 
@@ -290,16 +266,13 @@ def _varint(content: bytes, at: int) -> tuple[int, int]:
     raise ValueError("cut short")
 
 
-def _protobuf_time(content: bytes) -> int:
-    fields = protobuf_fields(content)
-    return _int(fields.get(1, 0)) * 1_000_000_000 + _int(fields.get(2, 0))
-
-
-def _int(value: int | bytes) -> int:
+def _int(fields: dict[int, int | bytes], number: int) -> int:
+    value = fields.get(number)
     return value if isinstance(value, int) else 0
 
 
-def _bytes(value: int | bytes) -> bytes:
+def _bytes(fields: dict[int, int | bytes], number: int) -> bytes:
+    value = fields.get(number)
     return value if isinstance(value, bytes) else b""
 
 
@@ -330,19 +303,8 @@ class ImageTopic:
 def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> ImageTopic:
     """Return the topic wanted, or the only one that is not known to be empty.
 
-    Parameters
-    ----------
-    where : str
-        For messages.
-    topics : list of ImageTopic
-        With images.
-
-    Raises
-    ------
-    SourceError
-        If there are no images at all.
-    OptionError
-        If several topics have images and none is named, or the one named has none.
+    `where`: for messages. Raises `SourceError` if there are no images at all. Raises `OptionError`
+    if several topics have images and none is named, or the one named has none.
     """
     if wanted is None:
         topics = [topic for topic in topics if topic.n_messages != 0]
@@ -363,23 +325,10 @@ def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> Im
 class MessageSource(Closing):
     """Source of the images of one topic; satisfies `FrameSource`.
 
-    Parameters
-    ----------
-    name : str
-        Path and topic.
-    messages : callable
-        Begins to read, from the first message on; ends early where the recording is cut short,
-        by raising `SourceError`.
-    n_frames : int or None
-        Messages that the recording promises.
+    `messages`: begins to read, from the first message on; ends early where the recording is cut
+    short, by raising `SourceError`. `n_frames`: messages that the recording promises. Raises
+    `SourceError` if no picture can be decoded at the start, or its encoding is unknown.
 
-    Raises
-    ------
-    SourceError
-        If no picture can be decoded at the start, or its encoding is unknown.
-
-    Notes
-    -----
     Times are those of the pictures where the messages have them, else those of the log. Pictures of
     a video that are predicted from a lost one are not delivered (see `LiveDecoder`).
     """

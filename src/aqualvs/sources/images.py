@@ -82,17 +82,9 @@ def is_image_name(path: Path) -> bool:
 class ImageSource(Closing):
     """Source of images as frames, in natural order of their names (`img2` before `img10`).
 
-    Parameters
-    ----------
-    paths : Path or sequence of Path
-        A folder, or the images themselves (taken in the order given).
-    fps : float
-        Images have no clock: `Frame.time_s` is the index divided by this.
-
-    Raises
-    ------
-    SourceError
-        If there is no image, or the first one cannot be read.
+    `paths`: a folder, or the images themselves (taken in the order given). `fps`: images have no
+    clock; `Frame.time_s` is the index divided by this. Raises `SourceError` if there is no image,
+    or the first one cannot be read.
     """
 
     def __init__(self, paths: Path | Sequence[Path], *, fps: float = 1.0) -> None:
@@ -116,21 +108,18 @@ class ImageSource(Closing):
             image = read_image(path)
             if image is None:
                 continue
-            self._check_size(path, image)
+            size = (image.shape[1], image.shape[0])
+            if size != self.size_px:
+                raise SourceError(
+                    f"{path}: {size[0]}x{size[1]} px, but the first image has "
+                    f"{self.size_px[0]}x{self.size_px[1]} px; keep one size a folder"
+                )
             refuse_stack(path, image, SourceError)
             luma, chroma = planes_of_image(image)
             yield Frame(index, index / self.fps, luma, chroma)
             last = index
         if last + 1 < self.n_frames:
             raise SourceError(_unreadable(self._paths[-1]))
-
-    def _check_size(self, path: Path, image: ImagePlane) -> None:
-        size = (image.shape[1], image.shape[0])
-        if size != self.size_px:
-            raise SourceError(
-                f"{path}: {size[0]}x{size[1]} px, but the first image has "
-                f"{self.size_px[0]}x{self.size_px[1]} px; keep one size a folder"
-            )
 
 
 def _unreadable(path: Path) -> str:
@@ -161,18 +150,9 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
     """Return an image as the camera read it out, or None if it cannot be decoded.
 
     What a file says about how to turn it for a viewer (EXIF) is ignored, as decoders of video do: a
-    camera model holds for the sensor.
-
-    Parameters
-    ----------
-    how : int
-        OpenCV's flag; the default returns grey images as grey.
-
-    Returns
-    -------
-    image : array or None
-        None for pipes and devices too, for JPEG files that are cut short, and for images of more
-        pixels than OpenCV is told to take (`aqualvs/__init__.py`).
+    camera model holds for the sensor. None is returned for pipes and devices too, for JPEG files
+    that are cut short, and for images of more pixels than OpenCV is told to take
+    (`aqualvs/__init__.py`). `how`: OpenCV's flag; the default returns grey images as grey.
     """
     try:
         if not path.is_file() or _is_cut_jpeg(path):

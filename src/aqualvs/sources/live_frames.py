@@ -36,22 +36,11 @@ class Unwrapper:
         self._last: int | None = None
 
     def __call__(self, value: int) -> int:
-        """Return the value on an endless line, nearest to the one before.
-
-        Parameters
-        ----------
-        value : int
-            As received; may lie a little before the last one.
-
-        Returns
-        -------
-        continued : int
-        """
+        """Return a received value on an endless line, nearest to the one before."""
         if self._last is None:
             self._last = value
-        else:
-            half = self._span // 2
-            self._last += (value - self._last + half) % self._span - half
+        half = self._span // 2
+        self._last += (value - self._last + half) % self._span - half
         return self._last
 
 
@@ -73,31 +62,22 @@ class StreamClock:
         self._last_arrival: float | None = None
 
     def set_tick(self, tick: float) -> None:
-        """Go on with ticks of another length, after a new connection.
-
-        `tick`: seconds; positive.
-        """
+        """Go on with ticks of another length in seconds, after a new connection."""
         self._tick = tick
         self._anchor_ticks = None
 
     def time_of(self, ticks: int | None, arrival: float) -> float:
-        """Return the time of a picture.
+        """Return the time of a picture, in seconds since the first one asked for.
 
-        Parameters
-        ----------
-        ticks : int or None
-            By the stream's clock; None where it has none, then the arrival counts.
-        arrival : float
-            Seconds on this machine's monotonic clock.
-
-        Returns
-        -------
-        time : float
-            Seconds since the first picture asked for.
+        `ticks`: by the stream's clock; None where it has none, then the arrival counts. `arrival`:
+        seconds on this machine's monotonic clock.
         """
         passed = 0.0 if self._last_arrival is None else max(0.0, arrival - self._last_arrival)
-        expected = self._last + passed
-        time = self._from_ticks(ticks, expected)
+        time = expected = self._last + passed
+        if ticks is not None:
+            if self._anchor_ticks is None:
+                self._anchor, self._anchor_ticks = expected, ticks
+            time = self._anchor + (ticks - self._anchor_ticks) * self._tick
         # Greatest difference of stream and arrival times for one sender: buffers hold no more.
         disagree_s = 5.0
         if time < self._last or abs(time - expected) > disagree_s:
@@ -105,13 +85,6 @@ class StreamClock:
             time = expected
         self._last, self._last_arrival = time, arrival
         return time
-
-    def _from_ticks(self, ticks: int | None, expected: float) -> float:
-        if ticks is None:
-            return expected
-        if self._anchor_ticks is None:
-            self._anchor, self._anchor_ticks = expected, ticks
-        return self._anchor + (ticks - self._anchor_ticks) * self._tick
 
 
 _SILENT_S = 0.5
@@ -121,12 +94,7 @@ _SILENT_S = 0.5
 class Reception:
     """Log of what arrived and when; written by the source, read from another thread.
 
-    Parameters
-    ----------
-    name : str
-        Of the part.
-    content : str
-        What arrives, such as "RTP H.264"; may be set later.
+    `name`: of the part. `content`: what arrives, such as "RTP H.264"; may be set later.
     """
 
     def __init__(self, name: str, content: str = "") -> None:
@@ -166,24 +134,15 @@ class Reception:
             self._fault = words
 
     def note_frame(self, size_px: tuple[int, int], n_lost: int) -> None:
-        """Note a frame that goes out.
-
-        Parameters
-        ----------
-        size_px : (int, int)
-            Width and height.
-        n_lost : int
-            Frames lost before it.
-        """
+        """Note a frame that goes out, its width and height, and how many were lost before it."""
         now = time.monotonic()
         with self._lock:
             self._size = size_px
             self._frames.append(now)
             self._last_frame = now
             self._n_held = 0
-            if n_lost:
-                self._losses.append((now, n_lost))
-                self._n_lost += n_lost
+            self._losses.append((now, n_lost))
+            self._n_lost += n_lost
             self._forget(now)
 
     def note_held(self, n: int) -> None:
@@ -256,16 +215,9 @@ before the end of a gradual refresh."""
 class LiveDecoder:
     """Decoder for a stream; after damage it waits for undamaged pictures.
 
-    Parameters
-    ----------
-    codec : VideoCodecContext
-        Not yet opened; taken over.
-    reports_losses : bool
-        Whether the caller learns of every loss from the transport. If not, the numbers of H.264's
-        pictures are watched.
+    `codec`: not yet opened; taken over. `reports_losses`: whether the caller learns of every loss
+    from the transport. If not, the numbers of H.264's pictures are watched.
 
-    Notes
-    -----
     A picture predicted from a lost or damaged one looks sound and is not: stripes stand where they
     stood before. So after each loss, and after each picture that FFmpeg had to patch up, nothing
     is delivered until a key frame, or a completed gradual refresh, which are decoded exactly.
@@ -282,15 +234,12 @@ class LiveDecoder:
         codec.flags |= int(Flags.low_delay)
         self._numbers = FrameNumbers() if codec.name == "h264" and not reports_losses else None
         if self._numbers is not None and codec.extradata:
-            self._learn(codec.extradata)
+            # Parameter sets with lengths instead of start codes are left unread.
+            if codec.extradata.startswith(b"\x01"):
+                self._numbers = None
+            else:
+                self._numbers.is_gap_before(codec.extradata)
         self._waits_for_key = codec.name not in _KNOWS_SOUND
-
-    def _learn(self, extradata: bytes) -> None:
-        """Read the parameter sets; units with lengths instead of start codes are left unread."""
-        if extradata.startswith(b"\x01") or self._numbers is None:
-            self._numbers = None
-        else:
-            self._numbers.is_gap_before(extradata)
 
     def reset(self) -> None:
         """Wait for a picture that needs no other: something was lost."""
@@ -301,17 +250,9 @@ class LiveDecoder:
             self._numbers.restart()
 
     def decode(self, packet: "Packet[VideoStream]") -> list[VideoFrame]:
-        """Return the sound pictures that a packet completes.
+        """Return the sound pictures that a packet, a whole picture, completes.
 
-        Parameters
-        ----------
-        packet : Packet
-            A whole picture.
-
-        Returns
-        -------
-        pictures : list of VideoFrame
-            In order of presentation; empty while waiting.
+        They are in order of presentation; there are none while waiting.
         """
         if packet.is_corrupt:
             self.reset()
@@ -323,9 +264,6 @@ class LiveDecoder:
         except (av.error.FFmpegError, ValueError):
             self.reset()
             return []
-        return self._sound(pictures)
-
-    def _sound(self, pictures: list[VideoFrame]) -> list[VideoFrame]:
         sound = []
         for picture in pictures:
             if picture.is_corrupt:
@@ -349,7 +287,8 @@ class LiveFrames:
         self._frame_counter = FrameCounter(counts_packets=True)
         self._clock = StreamClock(1.0)
         self._decoder: LiveDecoder | None = None
-        self._spacing = _Spacing()
+        # Times between the latest pictures.
+        self._spacings: deque[float] = deque(maxlen=15)
         self._first: int | None = None
         self._last_index = -1
         self._last_time = 0.0
@@ -359,14 +298,8 @@ class LiveFrames:
     def connect(self, codec: VideoCodecContext, tick: float, *, reports_losses: bool) -> None:
         """Begin with a new decoder; pictures in the old one are lost.
 
-        Parameters
-        ----------
-        codec : VideoCodecContext
-            Not yet opened.
-        tick : float
-            Unit of the packets' time, in seconds.
-        reports_losses : bool
-            As for `LiveDecoder`.
+        `codec`, `reports_losses`: as for `LiveDecoder`. `tick`: unit of the packets' time, in
+        seconds.
         """
         self._decoder = LiveDecoder(codec, reports_losses=reports_losses)
         self._frame_counter.restart()
@@ -392,16 +325,9 @@ class LiveFrames:
         self._hold()
 
     def feed(self, packet: "Packet[VideoStream]") -> Iterator[Frame]:
-        """Yield the frames that a packet completes.
+        """Yield the frames that a packet, a whole picture, completes.
 
-        Parameters
-        ----------
-        packet : Packet
-            A whole picture; `pts` in ticks, None where the stream has no clock.
-
-        Yields
-        ------
-        frame : Frame
+        Its `pts` is in ticks, None where the stream has no clock.
         """
         if self._decoder is None or packet.size == 0:
             return
@@ -437,26 +363,11 @@ class LiveFrames:
             return index
         step, passed = index - self._last_index, at - self._last_time
         if not self._lossy:
-            if step == 1:
-                self._spacing.learn(passed)
+            if step == 1 and passed > 0:
+                self._spacings.append(passed)
             return index
-        missing = max(0, self._spacing.count(passed) - step)
+        if not self._spacings:
+            return index
+        missing = max(0, round(passed / statistics.median(self._spacings)) - step)
         self._frame_counter.skip(missing)
         return index + missing
-
-
-class _Spacing:
-    """Estimate of the time between pictures."""
-
-    def __init__(self) -> None:
-        self._seen: deque[float] = deque(maxlen=15)
-
-    def learn(self, passed: float) -> None:
-        if passed > 0:
-            self._seen.append(passed)
-
-    def count(self, passed: float) -> int:
-        """Return how many pictures fit into a time; 0 if the spacing is unknown."""
-        if not self._seen:
-            return 0
-        return round(passed / statistics.median(self._seen))

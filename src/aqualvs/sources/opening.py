@@ -30,13 +30,8 @@ if TYPE_CHECKING:
 class PacedFeed:
     """Recording as a feed: its frames by their own clock, or as fast as they are taken.
 
-    Parameters
-    ----------
-    source : FrameSource
-        Closed at the end.
-    realtime : bool
-        Whether each frame waits for its time. A consumer that is late is not made later: frames
-        that are due come at once.
+    `source`: closed at the end. `realtime`: whether each frame waits for its time; a consumer that
+    is late is not made later: frames that are due come at once.
     """
 
     def __init__(self, source: FrameSource, *, realtime: bool) -> None:
@@ -68,9 +63,13 @@ class PacedFeed:
         with self._source as source:
             began = time.monotonic()
             for frame in source:
-                if not self._wait_until(began + frame.time_s):
+                wait_s = began + frame.time_s - time.monotonic() if self._realtime else 0.0
+                if self._closed.wait(max(0.0, wait_s)):
                     break
-                self._update_progress(frame)
+                self._n_lost += frame.index - self._last_index - 1
+                self._last_index = frame.index
+                total = f" of {source.n_frames}" if source.n_frames else ""
+                self._progress = f"frame {frame.index + 1}{total}, {frame.time_s:.1f} s"
                 yield frame
 
     def health(self) -> PartHealth:
@@ -80,18 +79,6 @@ class PacedFeed:
     def close(self) -> None:
         """End the iteration."""
         self._closed.set()
-
-    def _wait_until(self, when: float) -> bool:
-        """Wait for the time of a frame; return False if closed meanwhile."""
-        if self._realtime:
-            return not self._closed.wait(max(0.0, when - time.monotonic()))
-        return not self._closed.is_set()
-
-    def _update_progress(self, frame: Frame) -> None:
-        self._n_lost += frame.index - self._last_index - 1
-        self._last_index = frame.index
-        total = f" of {self._source.n_frames}" if self._source.n_frames else ""
-        self._progress = f"frame {frame.index + 1}{total}, {frame.time_s:.1f} s"
 
 
 STREAM_SCHEMES = ("http", "https", "rtmp", "rtp", "rtsp", "rtsps", "srt", "tcp", "udp")
@@ -145,7 +132,9 @@ def open_source(
     refuse_special(path)
     if path.suffix.lower() == ".mcap" or is_bag(path):
         _refuse(fps, path, "a recording has its own clock; leave the frame rate out")
-        return _message_source(path, topic)
+        from aqualvs.sources.bags import open_bag, open_mcap
+
+        return open_bag(path, topic) if is_bag(path) else open_mcap(path, topic)
     _refuse(topic, path, "only bags and MCAP files have topics; leave the topic out")
     if path.is_dir():
         return ImageSource(path, fps=fps or 1.0)
@@ -274,12 +263,6 @@ def _check_address(where: str) -> None:
     # Listening at UDP port 0 takes a free port; sending to port 0 is impossible.
     if port == 0 and parts.scheme.lower() not in ("udp", "rtp"):
         raise SourceError(f"{shown}: port 0 cannot be reached; {remedy}")
-
-
-def _message_source(path: Path, topic: str | None) -> FrameSource:
-    from aqualvs.sources.bags import open_bag, open_mcap
-
-    return open_bag(path, topic) if is_bag(path) else open_mcap(path, topic)
 
 
 def _stream_feed(where: str, transport: "Transport") -> Feed:

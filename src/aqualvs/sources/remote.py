@@ -103,14 +103,7 @@ _PROBE = {"fpsprobesize": "0", "analyzeduration": "1000000"}
 class RemoteFeed:
     """Feed of a container that FFmpeg opens, and reopens; satisfies `Feed`.
 
-    Parameters
-    ----------
-    name : str
-        How health and messages call it.
-    opener : callable
-        Opens the container; must not wait without end.
-    content : str
-        What arrives, for health.
+    `opener`: opens the container; must not wait without end. `content`: what arrives, for health.
     """
 
     def __init__(self, name: str, opener: Opener, *, content: str = "") -> None:
@@ -164,14 +157,9 @@ class RemoteFeed:
 
 
 def remote_feed(address: str, *, transport: Transport = "tcp") -> RemoteFeed:
-    """Return a feed from an address that FFmpeg knows.
+    """Return a feed from an address that FFmpeg knows: `rtsp://...`, `srt://...` and the like.
 
-    Parameters
-    ----------
-    address : str
-        `rtsp://...`, `srt://...`, `http://...`, `tcp://...` and the like.
-    transport : {"tcp", "udp"}
-        How RTSP sends: TCP repeats lost packets; UDP never waits for them.
+    `transport`: how RTSP sends: TCP repeats lost packets; UDP never waits for them.
     """
     scheme = address.partition("://")[0].lower()
     options = dict(_PROBE)
@@ -199,14 +187,12 @@ class CameraOptions:
 
     def for_ffmpeg(self) -> dict[str, str]:
         """Return the options of FFmpeg's `v4l2` input."""
-        found = {}
-        if self.size_px is not None:
-            found["video_size"] = f"{self.size_px[0]}x{self.size_px[1]}"
-        if self.fps is not None:
-            found["framerate"] = f"{self.fps:g}"
-        if self.pixel_format is not None:
-            found["input_format"] = self.pixel_format
-        return found
+        found = {
+            "video_size": None if self.size_px is None else "x".join(map(str, self.size_px)),
+            "framerate": None if self.fps is None else f"{self.fps:g}",
+            "input_format": self.pixel_format,
+        }
+        return {name: text for name, text in found.items() if text is not None}
 
 
 class CameraFeed(RemoteFeed):

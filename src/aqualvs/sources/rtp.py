@@ -62,13 +62,8 @@ class Ordered(NamedTuple):
 class RtpOrder:
     """Reordering buffer for the packets of one sender, which also detects losses.
 
-    Parameters
-    ----------
-    patience : float
-        Seconds for which a missing packet is awaited.
+    `patience`: seconds for which a missing packet is awaited.
 
-    Notes
-    -----
     A stray packet, of another sender or with a damaged number, is ignored. Two in a row that fit
     each other are a restarted sender; if it has another identity, the old one must be
     silent, so that of two senders to one port the first is kept.
@@ -102,7 +97,7 @@ class RtpOrder:
         if step > 0 and not self._kept:
             self._missing_since = arrival
         self._kept[packet.sequence] = packet
-        return self._due(arrival)
+        return self.overdue(arrival)
 
     @property
     def wait(self) -> float | None:
@@ -110,18 +105,15 @@ class RtpOrder:
         return self._timeout if self._kept else None
 
     def overdue(self, arrival: float) -> list[Ordered]:
-        """Return the packets that have waited too long for a missing one.
+        """Return the packets whose turn has come, or that have waited too long for a missing one.
 
         `arrival`: now, in seconds on the monotonic clock.
         """
-        return self._due(arrival)
-
-    def _due(self, arrival: float) -> list[Ordered]:
         most_kept = 32  # Later packets kept while one is missing.
         ready = self._run(after_loss=False)
         late = arrival - self._missing_since >= self._timeout
         while self._kept and (late or len(self._kept) > most_kept):
-            self._next = min(self._kept, key=self._distance)
+            self._next = min(self._kept, key=lambda number: (number - self._next) % 0x10000)
             ready += self._run(after_loss=True)
             self._missing_since = arrival
             late = False
@@ -134,9 +126,6 @@ class RtpOrder:
             run.append(Ordered(packet, after_loss and not run, False))
             self._next = (self._next + 1) % 0x10000
         return run
-
-    def _distance(self, sequence: int) -> int:
-        return (sequence - self._next) % 0x10000
 
     def _consider(self, packet: RtpPacket, arrival: float) -> list[Ordered]:
         """Keep packets that do not fit until they show that a sender begins anew."""
@@ -304,8 +293,6 @@ _RESTART_TICKS = 10 * TICKS_HZ
 class TransportStream:
     """Demultiplexer of the first video of an MPEG-TS, from packets of 188 bytes.
 
-    Notes
-    -----
     The stream does not say where a picture ends, only where the next one begins. Muxers fill up
     the last packet of a picture; so a filled packet ends it, and no picture waits for the next.
     Where that proves wrong once, it is given up.
@@ -326,17 +313,9 @@ class TransportStream:
         self._ended_early = False
 
     def push(self, content: bytes) -> list[AccessUnit]:
-        """Return the pictures that some packets complete.
+        """Return the pictures that whole packets complete; what does not begin as one is ignored.
 
-        Parameters
-        ----------
-        content : bytes
-            Whole packets; what does not begin as one is ignored.
-
-        Returns
-        -------
-        pictures : list of AccessUnit
-            `is_whole` is False for those that miss a packet; their `data` is empty.
+        `is_whole` is False for pictures that miss a packet; their `data` is empty.
         """
         done: list[AccessUnit] = []
         for at in range(0, len(content) - PACKET_BYTES + 1, PACKET_BYTES):
@@ -355,9 +334,12 @@ class TransportStream:
             if packet == self._last:  # Sent or received twice.
                 return []
             self._last = packet
+            done = []
             if packet[1] & 0x80 or not self._follows(pid, packet[3] & 15):
-                return self._lose() + self._video_packet(packet[start:], begins, filled)
-            return self._video_packet(packet[start:], begins, filled)
+                # The picture misses a packet.
+                self._after_loss = True
+                done = self._close(is_whole=False)
+            return done + self._video_packet(packet[start:], begins, filled)
         if begins and start < PACKET_BYTES:
             self._table(pid, packet[start + 1 + packet[start] :])
         return []
@@ -391,11 +373,6 @@ class TransportStream:
                 return
             at += 5 + ((section[at + 3] & 15) << 8 | section[at + 4])
 
-    def _lose(self) -> list[AccessUnit]:
-        """Give up the picture that misses a packet."""
-        self._after_loss = True
-        return self._close(is_whole=False)
-
     def _video_packet(self, payload: bytes, begins: bool, filled: bool) -> list[AccessUnit]:
         done = []
         if begins:
@@ -423,16 +400,11 @@ class TransportStream:
         if len(payload) < 9 or payload[:3] != b"\x00\x00\x01" or payload[3] & 0xF0 != 0xE0:
             return
         start = 9 + payload[8]
-        self._stamp(_time(payload) if payload[7] & 0x80 and len(payload) >= 14 else None)
         self._parts, self._n_bytes = [payload[start:]], len(payload) - start
-
-    def _stamp(self, time: int | None) -> None:
         self._is_restart = False
-        if time is None:
-            return
-        before = self._ticks
-        self._ticks = self._unwrap(time)
-        self._is_restart = before is None or abs(self._ticks - before) > _RESTART_TICKS
+        if payload[7] & 0x80 and len(payload) >= 14:
+            before, self._ticks = self._ticks, self._unwrap(_time(payload))
+            self._is_restart = before is None or abs(self._ticks - before) > _RESTART_TICKS
 
     def _close(self, *, is_whole: bool) -> list[AccessUnit]:
         parts, self._parts = self._parts, None

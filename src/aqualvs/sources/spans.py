@@ -30,7 +30,7 @@ from aqualvs.sources.base import frame_of
 from aqualvs.sources.images import ImageSource, images_in
 
 if TYPE_CHECKING:
-    from aqualvs.sources.h264 import FieldPairs, UnitReader
+    from aqualvs.sources.h264 import UnitReader
 
 # Codecs without prediction between pictures.
 _INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffvhuff", "utvideo"})
@@ -60,10 +60,8 @@ class Span:
     # Time of the first packet and of the dive's first picture, in ticks of the stream.
     start_pts: int = 0
     origin_pts: int = 0
-    # Size of the packets, or of the files.
-    n_bytes: int = 0
-    # CRC-32 of the packets with their times.
-    checksum: int = 0
+    n_bytes: int = 0  # Size of the packets, or of the files.
+    checksum: int = 0  # CRC-32 of the packets with their times.
     # Frames at the beginning and at the end that are those of the spans beside it, for what depends
     # on a frame's neighbours; they count in `first`, `stop` and `checksum`.
     lead: int = 0
@@ -76,28 +74,18 @@ class VideoSpans:
 
     # In order, without gaps between their own frames; empty if the video must stay whole.
     spans: tuple[Span, ...]
-    # Why it must; empty if it need not.
-    why_whole: str
+    why_whole: str  # Why it must; empty if it need not.
     # Of all packets.
     checksum: int
-    # Of all packets.
     n_bytes: int
 
 
 def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
     """Read a video's packets, without decoding them, and find where it may be cut.
 
-    Parameters
-    ----------
-    n_min : int
-        Frames that a part has at least, but for the last.
-    margin : int
-        Frames that a part holds at least of those beside it.
-
-    Raises
-    ------
-    av.error.FFmpegError, OSError
-        As FFmpeg says it, if the file cannot be opened.
+    `n_min`: frames that a part has at least, but for the last. `margin`: frames that it holds at
+    least of those beside it. Raises `av.error.FFmpegError` or `OSError` as FFmpeg says it, if the
+    file cannot be opened.
     """
     with av.open(str(path), timeout=_TIMEOUT_S) as container:
         stream = container.streams.video[0]
@@ -111,20 +99,14 @@ def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
             packets.doubt("pictures without a time of their own")
         why = packets.why_whole() or _missing_end(stream, packets)
         spans = () if why else packets.spans(n_min, margin)
-        return VideoSpans(spans, why, packets.checksum, packets.n_bytes)
+        return VideoSpans(spans, why, joint_checksum(packets.checksums), sum(packets.sizes))
 
 
 def image_spans(sizes: Sequence[int], n_min: int, margin: int = 0) -> tuple[Span, ...]:
     """Cut a folder of images into parts.
 
-    Parameters
-    ----------
-    sizes : sequence of int
-        Of the files, in bytes, in their order.
-    n_min : int
-        Images that a part has, but for the last.
-    margin : int
-        As in `video_spans`.
+    `sizes`: of the files, in bytes, in their order. `n_min`: images that a part has, but for the
+    last. `margin`: as in `video_spans`.
     """
     edges = [*range(0, len(sizes), n_min), len(sizes)]
     found = []
@@ -157,31 +139,23 @@ class _PacketIndex:
     """Packets read so far, and the first reason found not to cut the video."""
 
     def __init__(self, stream: VideoStream) -> None:
+        from aqualvs.sources.h264 import field_pairs, unit_reader
+
         self._stream = stream
-        self._name = stream.codec_context.name
+        context = stream.codec_context
+        self._name = context.name
         self._pts: list[int] = []
-        self._sizes: list[int] = []
-        self._sums: list[int] = []
+        self.sizes: list[int] = []  # Of all packets but empty ones, in bytes.
+        self.checksums: list[int] = []
         self._cuts: list[int] = []
         self._doubt = ""
-        self._units = self._reader()
-        self._fields = self._field_pairs()
+        self._units: UnitReader | None = None
+        try:
+            self._units = unit_reader(context.name, context.extradata or b"")
+        except ValueError as fault:
+            self.doubt(str(fault))
+        self._fields = field_pairs(context.name, context.extradata)
         self._sets_in_band = False
-
-    @property
-    def n_bytes(self) -> int:
-        """Size of the packets."""
-        return sum(self._sizes)
-
-    @property
-    def checksum(self) -> int:
-        """Checksum of all packets."""
-        return joint_checksum(self._sums)
-
-    @property
-    def n_packets(self) -> int:
-        """Packets that are no empty ones."""
-        return len(self._sums)
 
     def doubt(self, words: str) -> None:
         """Note that the video must stay whole."""
@@ -200,8 +174,8 @@ class _PacketIndex:
         if self._can_start_at(packet):
             self._cuts.append(len(self._pts))
         self._pts.append(packet.pts or 0)
-        self._sizes.append(packet.size)
-        self._sums.append(packet_checksum(packet))
+        self.sizes.append(packet.size)
+        self.checksums.append(packet_checksum(packet))
 
     def why_whole(self) -> str:
         """Return why the video must stay whole, empty if it need not."""
@@ -227,8 +201,8 @@ class _PacketIndex:
                     stop=end,
                     start_pts=self._pts[begin],
                     origin_pts=origin,
-                    n_bytes=sum(self._sizes[first:stop]),
-                    checksum=joint_checksum(self._sums[begin:end]),
+                    n_bytes=sum(self.sizes[first:stop]),
+                    checksum=joint_checksum(self.checksums[begin:end]),
                     lead=first - begin,
                     trail=end - stop,
                 )
@@ -250,22 +224,6 @@ class _PacketIndex:
             for cut in self._cuts
             if earliest[cut] == pts[cut] and (cut == 0 or latest[cut - 1] < pts[cut])
         ]
-
-    def _reader(self) -> "UnitReader | None":
-        from aqualvs.sources.h264 import unit_reader
-
-        context = self._stream.codec_context
-        try:
-            return unit_reader(context.name, context.extradata or b"")
-        except ValueError as fault:
-            self.doubt(str(fault))
-            return None
-
-    def _field_pairs(self) -> "FieldPairs | None":
-        from aqualvs.sources.h264 import field_pairs
-
-        context = self._stream.codec_context
-        return field_pairs(context.name, context.extradata)
 
     def _can_start_at(self, packet: "Packet[VideoStream]") -> bool:
         if self._units is None:
@@ -292,10 +250,10 @@ def _missing_end(stream: VideoStream, packets: _PacketIndex) -> str:
     slots = time_slots(stream)
     if slots is not None:
         passed = packets.latest_s() / float(stream.time_base)
-        filled = slots.are_filled(passed, packets.n_packets)
+        filled = slots.are_filled(passed, len(packets.sizes))
         return "" if filled else "ends before its promise"
     if stream.frames:
-        return "" if packets.n_packets >= stream.frames else "fewer pictures than promised"
+        return "" if len(packets.sizes) >= stream.frames else "fewer pictures than promised"
     promised_s, rate = stated_duration(stream), frame_rate(stream)
     if promised_s is None or not rate:
         return ""
@@ -335,14 +293,7 @@ class TimeSlots:
     period: float  # From one picture to the next at the nominal rate, in ticks.
 
     def are_filled(self, passed: float, n_pictures: int) -> bool:
-        """Return whether pictures reach the end.
-
-        Parameters
-        ----------
-        passed : float
-            From the first picture to the last, in ticks.
-        n_pictures : int
-        """
+        """Return whether pictures reach the end; `passed`: from first to last, in ticks."""
         # The last one may be shown for longer than the mean. At a steady rate less than two, so
         # that one missing picture is noticed.
         longer = 1.5

@@ -17,9 +17,7 @@ from pathlib import Path
 from typing import cast
 
 import av
-from av.packet import Packet
 from av.video.codeccontext import VideoCodecContext
-from av.video.stream import VideoStream
 
 from aqualvs.errors import SourceError
 from aqualvs.scanning.scan import Frame
@@ -44,7 +42,6 @@ from aqualvs.sources.rtp import (
     AccessUnit,
     H264Depacketizer,
     RtpOrder,
-    RtpPacket,
     TransportStream,
     parse_rtp,
 )
@@ -133,7 +130,9 @@ def rtp_frames(
             packet = parse_rtp(datagram.content)
             if datagrams.is_foreign(datagram, fits=packet is not None):
                 return
-            if packet is None or not _is_video(packet, payload_type):
+            # Without a type that is wanted, every dynamic one is.
+            wanted = range(96, 128) if payload_type is None else (payload_type,)
+            if packet is None or packet.payload_type not in wanted:
                 continue
             due = order.push(packet, datagram.arrival)
             if pictures.n_foreign > MAX_FOREIGN:
@@ -144,13 +143,6 @@ def rtp_frames(
         for ordered in due:
             for picture in pictures.push(ordered):
                 yield from decoded(frames, picture)
-
-
-def _is_video(packet: RtpPacket, payload_type: int | None) -> bool:
-    """Return whether a packet is of the type wanted, or, without one, of a dynamic type."""
-    return (
-        packet.payload_type >= 96 if payload_type is None else packet.payload_type == payload_type
-    )
 
 
 def _in_time(frames: LiveFrames, datagrams: Datagrams) -> Iterator[Datagram]:
@@ -204,21 +196,18 @@ def decoded(frames: LiveFrames, picture: AccessUnit) -> Iterator[Frame]:
         frames.restart()
     if picture.after_loss:
         frames.lose()
+    packet = packet_with(picture.data if picture.is_whole else b"\x00")
+    packet.pts, packet.time_base = picture.ticks, Fraction(1, TICKS_HZ)
     if picture.is_whole:
-        yield from frames.feed(packet_of(picture.data, picture.ticks))
+        yield from frames.feed(packet)
     else:
-        frames.announce(packet_of(b"\x00", picture.ticks))
+        frames.announce(packet)
 
 
 def decoder_of(codec: str, parameter_sets: bytes = b"") -> VideoCodecContext:
-    """Return a decoder, not yet opened.
+    """Return a decoder, not yet opened, by FFmpeg's name.
 
-    Parameters
-    ----------
-    codec : str
-        FFmpeg's name.
-    parameter_sets : bytes
-        SPS and PPS as a byte stream, or nothing.
+    `parameter_sets`: SPS and PPS as a byte stream, or nothing.
     """
     found = cast("VideoCodecContext", av.CodecContext.create(codec, "r"))
     if parameter_sets:
@@ -226,35 +215,12 @@ def decoder_of(codec: str, parameter_sets: bytes = b"") -> VideoCodecContext:
     return found
 
 
-def packet_of(data: bytes, ticks: int) -> "Packet[VideoStream]":
-    """Return a packet of a stream with the clock of video in RTP.
-
-    Parameters
-    ----------
-    data : bytes
-        One picture as a byte stream.
-    ticks : int
-        90 kHz.
-    """
-    packet = packet_with(data)
-    packet.pts, packet.time_base = ticks, Fraction(1, TICKS_HZ)
-    return packet
-
-
 class UdpFeed:
     """Feed from a UDP port, whatever kind of stream arrives; satisfies `Feed`.
 
-    Parameters
-    ----------
-    name : str
-        How health and messages call it.
-    parameter_sets : bytes
-        SPS and PPS as a byte stream, where an SDP file has them; else they come in the stream.
-    payload_type : int or None
-        Of RTP; None takes every dynamic one (96 to 127).
+    `parameter_sets`: SPS and PPS as a byte stream, where an SDP file has them; else they come in
+    the stream. `payload_type`: of RTP; None takes every dynamic one (96 to 127).
 
-    Notes
-    -----
     RTP and MPEG-TS are unpacked here and not by FFmpeg, whose interface hides which packets are
     lost, and which probes a stream before it shows a picture and holds one or two back. What a
     bare stream loses is found by the pictures' numbers only, and each of its pictures waits for
@@ -288,10 +254,13 @@ class UdpFeed:
         # Pause between two attempts to listen.
         retry_s = 0.5
         while not self._closed.is_set():
-            datagrams = self._listen(self._address)
-            if datagrams is None:
+            try:
+                datagrams = Datagrams(self._address, self._closed, self._reception)
+            except OSError as fault:
+                self._reception.note_fault(listening_fault(self._address, fault))
                 self._closed.wait(retry_s)
                 continue
+            self._reception.note_fault("")
             self._datagrams = datagrams
             with closing(datagrams):
                 yield from self._receive(datagrams)
@@ -306,15 +275,6 @@ class UdpFeed:
         self._reception.end("closed")
         if self._datagrams is not None:
             self._datagrams.wake()
-
-    def _listen(self, address: UdpAddress) -> Datagrams | None:
-        try:
-            found = Datagrams(address, self._closed, self._reception)
-        except OSError as fault:
-            self._reception.note_fault(listening_fault(address, fault))
-            return None
-        self._reception.note_fault("")
-        return found
 
     def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:
         """Yield frames of any kind of content, which may change."""

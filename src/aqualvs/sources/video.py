@@ -11,7 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Final, NoReturn
 
 import av
 from av.container import InputContainer
@@ -97,15 +97,7 @@ class FrameCounter:
     def number(self, pts: int | None) -> int:
         """Return the number of a picture, counting those lost before it.
 
-        Parameters
-        ----------
-        pts : int or None
-            Its time, in ticks of its stream.
-
-        Returns
-        -------
-        index : int
-            Greater than that of the picture before.
+        `pts`: its time, in ticks of its stream.
         """
         if self.first_pts is None and pts is not None:
             self.first_pts = min([pts, *self._pending[:1]])
@@ -118,10 +110,7 @@ class FrameCounter:
         return self._next - 1
 
     def skip(self, n: int) -> None:
-        """Count pictures as lost whose packets never came.
-
-        `n`: not negative.
-        """
+        """Count pictures as lost whose packets never came."""
         self._next += n
 
     def restart(self) -> None:
@@ -147,20 +136,11 @@ _MAX_HELD = 16
 
 
 class VideoSource(Closing):
-    """A video file, or a stream that FFmpeg can open.
+    """A video file, or a stream that FFmpeg can open, by path or address.
 
-    Parameters
-    ----------
-    where : str or Path
-        Path or address.
+    Raises `SourceError` if the file is missing, empty or cut off before its index, or is not a
+    video.
 
-    Raises
-    ------
-    SourceError
-        If the file is missing, empty or cut off before its index, or is not a video.
-
-    Notes
-    -----
     Pictures that the decoder had to patch up are dropped, not delivered, and all that may be
     predicted from them, up to the next picture that needs no other: a stripe copied from the
     picture before would give a posture that looks sound. Damage that happens to be valid code goes
@@ -189,7 +169,9 @@ class VideoSource(Closing):
         self._promised_s = stated_duration(self._stream)
         self._slots = time_slots(self._stream)
         self._n_exact = 0 if self._slots is not None else self._stream.frames
-        self.n_frames = self._n_exact or self._estimated_frames()
+        self.n_frames: int | None = self._n_exact or None
+        if not self._n_exact and self._promised_s is not None and self.fps is not None:
+            self.n_frames = round(self._promised_s * self.fps)
         self._frame_counter = FrameCounter(
             counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS
         )
@@ -364,11 +346,6 @@ class VideoSource(Closing):
             return False
         return self._last_time_s + max(3 / self.fps, 0.02 * self._promised_s) < self._promised_s
 
-    def _estimated_frames(self) -> int | None:
-        if self._promised_s is None or self.fps is None:
-            return None
-        return round(self._promised_s * self.fps)
-
     def _video_stream(self) -> VideoStream:
         if not self._container.streams.video:
             self._container.close()
@@ -400,19 +377,15 @@ def _raise(fault: SourceError) -> NoReturn:
 
 # Pictures that are looked at for fields: so many in a row, at so many places of a file.
 _GROUP, _PLACES = 3, 3
-_TOP_FIRST, _BOTTOM_FIRST = (2, 5), (3, 4)
+_FIRST_FIELD: Final[dict[int, Field]] = {2: "top", 5: "top", 3: "bottom", 4: "bottom"}
 """AVFieldOrder of FFmpeg: by the field that is shown first, whichever is coded first."""
 
 
 def sampled_pictures(path: Path) -> tuple[list[list[Frame]], Field | None]:
     """Return a few pictures in a row from some places of a video, and which field comes first.
 
-    Returns
-    -------
-    groups : list of list of Frame
-        Without numbers and times; none from where the file is damaged.
-    first_field : {"top", "bottom"} or None
-        As the stream states it.
+    The pictures have no numbers and times; there are none from where the file is damaged. The field
+    is as the stream states it, None if it does not.
     """
     groups: list[list[Frame]] = []
     first_field: Field | None = None
@@ -424,9 +397,7 @@ def sampled_pictures(path: Path) -> tuple[list[list[Frame]], Field | None]:
                 container.seek(place * (container.duration or 0) // _PLACES)
             pictures = itertools.islice(container.decode(stream), _GROUP)
             groups.append([frame_of(0, 0.0, one) for one in pictures if not one.is_corrupt])
-        order = stream.codec_context.field_order
-        if order in _TOP_FIRST + _BOTTOM_FIRST:
-            first_field = "top" if order in _TOP_FIRST else "bottom"
+        first_field = _FIRST_FIELD.get(stream.codec_context.field_order)
     return groups, first_field
 
 
