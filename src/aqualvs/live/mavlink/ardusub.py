@@ -29,7 +29,7 @@ import numpy as np
 
 from aqualvs.control.sticks import FULL, MIDDLE, PARAMETERS, Sticks, shaping_of
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
-from aqualvs.errors import OptionError, check_positive
+from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub_commands import (
     CENTRE_US,
     MAX_US,
@@ -235,16 +235,12 @@ class ArduSubOptions:
     station_timeout_s: float | None = 3.0
     # Deflection of the pilot's sticks that counts as centred, as a share of the full one.
     stick_dead_band: float = 0.1
-    # In GUIDED: what an effort of 1 forward, right or down asks for, in m/s.
+    # In GUIDED: what an effort of 1 forward, right or down asks for, in m/s; and in yaw, in rad/s.
     speed: float = 0.3
-    # In GUIDED: what an effort of 1 in yaw asks for, in rad/s.
     turning_rate: float = math.radians(30.0)
 
     def __post_init__(self) -> None:
-        """Check every value.
-
-        Raises `OptionError` if one makes no sense.
-        """
+        """Raise `OptionError` for what the types do not rule out; the others must be positive."""
         allowed = _KEEPS_DEPTH[self.command]
         for mode in self.modes:
             if mode not in allowed:
@@ -252,12 +248,6 @@ class ArduSubOptions:
                     f"ArduSub mode {mode}: cannot be steered by {self.command}; choose of "
                     f"{', '.join(allowed)}"
                 )
-        if not 1 <= self.ground_station <= 255:
-            raise OptionError(
-                f"ArduSub ground_station {self.ground_station}: must lie between 1 and 255"
-            )
-        timeout = () if self.station_timeout_s is None else ("station_timeout_s",)
-        check_positive("ArduSub", self, *timeout, "speed", "turning_rate")
         if not 0.0 < self.stick_dead_band < 1.0:
             raise OptionError(
                 f"ArduSub stick_dead_band {self.stick_dead_band:g}: must lie between 0 and 1"

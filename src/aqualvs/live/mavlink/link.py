@@ -62,8 +62,9 @@ class Received:
 class LinkOptions:
     """Own identity on a connection, and the peers that are heard."""
 
-    system: int = 1  # Own system id; that of the vehicle, whose part this computer is.
-    component: int = MAV_COMP_ID_ONBOARD_COMPUTER  # Own component id.
+    # Own ids, 1 to 255; the system is that of the vehicle, whose part this computer is.
+    system: int = 1
+    component: int = MAV_COMP_ID_ONBOARD_COMPUTER
     # Where a port listens, the only addresses that are heard, as `AllowedPeers` takes them;
     # everybody if empty. Other connections hear one peer only.
     peers: tuple[str, ...] = ()
@@ -72,12 +73,7 @@ class LinkOptions:
     key: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Check every value.
-
-        Raises `OptionError` if one makes no sense.
-        """
-        _check_id("system", self.system)
-        _check_id("component", self.component)
+        """Raise `OptionError` if a peer is no address."""
         AllowedPeers(self.peers)
 
 
@@ -416,11 +412,6 @@ def packed(message: Any, packer: Any) -> bytes:
     frame: bytes = message.pack(packer)
     packer.seq = (packer.seq + 1) % 256
     return frame
-
-
-def _check_id(name: str, value: int) -> None:
-    if not 1 <= value <= 255:
-        raise OptionError(f"MAVLink {name} id {value}: must lie between 1 and 255")
 
 
 def _dialect() -> Any:
