@@ -82,7 +82,7 @@ class Console(Output):
         self._on_screen = self._stream.isatty()
         # A log begins with what goes wrong: of a run that ends at once, nothing else is told.
         self._next_s = -math.inf if self._on_screen else time.monotonic() + _LOG_EVERY_S
-        self._parts: dict[str, tuple[State, str]] = {}
+        self._states: dict[str, State] = {}
 
     def send(self, sample: LiveSample) -> None:
         """Tell of parts that have changed at once, and of the posture when it is time."""
@@ -106,10 +106,9 @@ class Console(Output):
     def _report_changes(self, sample: LiveSample) -> None:
         health = sample.health
         for part in (health.source, *health.lasers, *health.outputs):
-            before = self._parts.get(part.name, (State.OFF, ""))[0]
-            self._parts[part.name] = part.state, part.detail
-            alarming = part.state in (State.WARN, State.FAULT)
-            if part.state is not before and (alarming or before in (State.WARN, State.FAULT)):
+            before = self._states.get(part.name, State.OFF)
+            self._states[part.name] = part.state
+            if part.state is not before and {part.state, before} & {State.WARN, State.FAULT}:
                 detail = part.detail and f": {part.detail}"
                 self._write(f"{part.name}: {part.state.value}{detail}", stays=True)
 
@@ -164,9 +163,7 @@ class LiveRequest:
     page: Page | None = None
     # Whether to record from the start; the page's button begins and ends recordings, too.
     record: bool = False
-    # Folder of recordings.
-    record_to: Path = Path("dives")
-
+    record_to: Path = Path("dives")  # Folder of recordings.
     record_video: bool = False
     smooth: bool = False  # Whether the time filter runs.
     fast: bool = False  # Measure every frame of a file, as fast as possible.
@@ -208,16 +205,9 @@ def make_runner(
 ) -> LiveRunner:
     """Make the live loop; if a part fails, the parts made before it are closed.
 
-    Parameters
-    ----------
-    provider : callable
-        Makes the provider of the scanner, after everything else.
-    holder : SetpointHolder
-        Where the page puts what is to be held.
-    first : iterable of Output
-        Outputs before all others; taken once the source is open.
-    vehicle : callable, optional
-        As `Page.serve` takes it; by default of the first output that an autopilot answers.
+    `provider`: makes the provider of the scanner, after everything else. `holder`, `vehicle`: as
+    `Page.serve` takes them; the vehicle is by default that of the first output that an autopilot
+    answers. `first`: outputs before all others; taken once the source is open.
     """
     sys.setswitchinterval(SWITCH_S)
     options = RecorderOptions(

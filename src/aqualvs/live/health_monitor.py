@@ -11,7 +11,6 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -358,8 +357,7 @@ to outputs that never wait; and of all of it."""
 _DARK_S = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class _FrameFigures:
+class _FrameFigures(NamedTuple):
     """Figures kept of one frame."""
 
     at_ns: int
@@ -391,10 +389,8 @@ class HealthMonitor:
         quality = float(scan.points.quality[used].mean()) if used.any() else float("nan")
         times = (instants.arrived_ns, instants.taken_ns, instants.scanned_ns, sent_ns)
         wait, measure, send = (1e-9 * (b - a) for a, b in itertools.pairwise(times))
-        total = wait + measure + send
-        self._frames.append(
-            _FrameFigures(sent_ns, bool(scan.posture), quality, (wait, measure, send, total))
-        )
+        delays_s = wait, measure, send, wait + measure + send
+        self._frames.append(_FrameFigures(sent_ns, bool(scan.posture), quality, delays_s))
         if scan.posture:
             self._valid_ns = sent_ns
             for i in np.unique(scan.points.laser[used]).tolist():
@@ -405,18 +401,8 @@ class HealthMonitor:
         """Stop watching the lasers."""
         self._drift.close()
 
-    def health(
-        self,
-        now_ns: int,
-        *,
-        source: PartHealth,
-        outputs: Sequence[PartHealth],
-        n_dropped: int,
-        n_lost: int,
-        n_water: float,
-        sigma_n_water: float,
-    ) -> Health:
-        """Return the state of things."""
+    def health(self, now_ns: int) -> Health:
+        """Return the state of things, as far as the frames and the lasers show it."""
         while self._frames and now_ns - self._frames[0].at_ns > 1e9 * WINDOW_S:
             self._frames.popleft()
         recent = self._frames
@@ -424,25 +410,19 @@ class HealthMonitor:
             rate_hz=self._rate_hz(now_ns),
             valid_share=sum(p.valid for p in recent) / len(recent) if recent else float("nan"),
             n_frames=self._n_frames,
-            n_dropped=n_dropped,
-            n_lost=n_lost,
             delays=self._delays(),
-            source=source,
             lasers=tuple(map(self._laser_health, range(len(self._names)))),
-            outputs=tuple(outputs),
             quality=_mean([p.quality for p in recent]),
-            n_water=n_water,
-            sigma_n_water=sigma_n_water,
         )
 
     def _rate_hz(self, now_ns: int) -> float:
-        if len(self._frames) < 2:
+        n = len(self._frames) - 1
+        if n < 1:
             return 0.0
         # While frames come the span ends with the last one; in silence the rate falls.
-        period_ns = (self._frames[-1].at_ns - self._frames[0].at_ns) / (len(self._frames) - 1)
-        silent_ns = now_ns - self._frames[-1].at_ns
-        span_ns = self._frames[-1].at_ns - self._frames[0].at_ns + max(0.0, silent_ns - period_ns)
-        return (len(self._frames) - 1) / max(1e-9 * span_ns, 1e-9)
+        last_ns = self._frames[-1].at_ns
+        span_ns = last_ns - self._frames[0].at_ns
+        return n / max(1e-9 * (span_ns + max(0.0, now_ns - last_ns - span_ns / n)), 1e-9)
 
     def _delays(self) -> tuple[StageDelay, ...]:
         if not self._frames:

@@ -134,12 +134,12 @@ def words_of(reason: LimitReason, state: VehicleState) -> str:
 
 def _aim_text(guidance: Guidance) -> str:
     """Return the aim of a mission."""
-    setpoint = guidance.setpoint
+    stage, setpoint = guidance.stage.value.replace("_", " "), guidance.setpoint
     if setpoint is None:
-        return guidance.stage.value.replace("_", " ")
+        return stage
     aim = f"{setpoint.range:.2f} m, yaw {math.degrees(setpoint.yaw):.0f} deg"
     sway = f", {guidance.sway:+.2f} m/s to the right" if guidance.sway else ""
-    return f"{guidance.stage.value.replace('_', ' ')}: {aim}{sway}"
+    return f"{stage}: {aim}{sway}"
 
 
 # Several, as datagrams may be lost; only one while the pilot moves his sticks, not to disturb him.
@@ -153,14 +153,8 @@ class Pilot(Output):
     sticks, disarming and a silent vehicle end that until `engage` is called again. Then neutral
     goes out a few times, and nothing more: further sticks of ours would be in the pilot's way.
 
-    Parameters
-    ----------
-    steering : NetPilot
-        Mission, controller and safety gate.
-    vehicle : VehicleLink
-        Closed with this output.
-    holder : SetpointHolder or None
-        Where the page puts the setpoint; a mission that holds follows it.
+    `vehicle`: closed with this output. `holder`: where the page puts the setpoint; a mission that
+    holds follows it.
     """
 
     name = "pilot"
@@ -203,7 +197,12 @@ class Pilot(Output):
             holds = isinstance(self._steering.mission, HoldMission)
             if holds and self._holder is not None and self._holder.setpoint is None:
                 raise OptionError(f"pilot: {LimitReason.NO_SETPOINT.words}; choose one first")
-            refused, state = self._engage()
+            try:
+                state = self._vehicle.state()
+                refused = self._steering.engage(time.monotonic(), state)
+            except BaseException:
+                self._steering.disengage()
+                raise
             if refused is not None:
                 raise OptionError(f"pilot: not engaged: {words_of(refused, state)}")
             self._fault, self._neutrals_left = "", 0
@@ -254,15 +253,6 @@ class Pilot(Output):
         self.disengage()
         self._watchdog.close()
         self._vehicle.close()
-
-    def _engage(self) -> tuple[LimitReason | None, VehicleState]:
-        """Start control; return the reason if it cannot start, and the vehicle's state."""
-        try:
-            state = self._vehicle.state()
-            return self._steering.engage(time.monotonic(), state), state
-        except BaseException:
-            self._steering.disengage()
-            raise
 
     def _decide(self, sample: LiveSample, now_s: float, state: VehicleState) -> Decision:
         mission = self._steering.mission

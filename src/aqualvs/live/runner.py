@@ -340,20 +340,8 @@ class LiveOptions:
 class LiveRunner:
     """Live loop: measures a feed as it comes and passes the results to the outputs.
 
-    Parameters
-    ----------
-    feed : Feed
-    provider : ScannerProvider
-        Closed at the end.
-    outputs : sequence of Output
-        Closed at the end.
-    posture_filter : PostureFilter or None
-        Smooths over time, in addition to the raw values.
-
-    Attributes
-    ----------
-    n_measured, n_postures : int
-        Frames measured until now; those with a posture.
+    `provider` and `outputs` are closed at the end. `posture_filter`: smooths over time, in addition
+    to the raw values. `n_measured`, `n_postures`: frames measured until now; those with a posture.
 
     The first output that an autopilot answers tells how the vehicle turns, for a rolling shutter.
     """
@@ -411,10 +399,10 @@ class LiveRunner:
         now_ns = time.monotonic_ns()
         if now_ns - self._health_ns > 1e9 * _HEALTH_EVERY_S:
             self._health_ns = now_ns
-            self._health = self._monitor.health(
-                now_ns,
+            self._health = replace(
+                self._monitor.health(now_ns),
                 source=self._reader.health(),
-                outputs=[worker.health() for worker in self._workers],
+                outputs=tuple(worker.health() for worker in self._workers),
                 n_dropped=self._mailbox.n_dropped,
                 n_lost=self._reader.n_lost,
                 n_water=self._provider.scanner.rig.n_water,

@@ -176,13 +176,9 @@ class Access:
     def is_own_page(self, origin: str | None, host: str) -> bool:
         """Return whether a connection comes from the page itself rather than from a foreign one.
 
-        Parameters
-        ----------
-        origin : str or None
-            The header that browsers send with the page's address; programs send none.
-        host : str
-            The header with the address as the browser knows it. Served to this machine only, it
-            must be a name of this machine: a foreign name that points here is an attack.
+        `origin`: the header that browsers send with the page's address; programs send none. `host`:
+        the header with the address as the browser knows it. Served to this machine only, it must be
+        a name of this machine: a foreign name that points here is an attack.
         """
         if self.is_local and urlsplit(f"//{host}").hostname not in _LOCAL_NAMES:
             return False

@@ -51,12 +51,7 @@ def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
 class Dashboard(Output):
     """Output to the open pages; costs next to nothing while there is none.
 
-    Parameters
-    ----------
-    server : DashboardServer
-        Owned from here on.
-    vehicle : callable
-        Returns what the autopilot tells of depth and heading.
+    `server`: owned from here on. `vehicle`: returns what the autopilot tells of depth and heading.
     """
 
     name = "dashboard"

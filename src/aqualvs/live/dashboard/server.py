@@ -83,7 +83,6 @@ def page_state(
 
 def rig_state(rig: Rig, *, may_command: bool, holds: bool) -> str:
     """Return the first message of a connection: the data that do not change."""
-    near, far = rig.working_range
     found = {
         "kind": "rig",
         "name": rig.name,
@@ -91,7 +90,7 @@ def rig_state(rig: Rig, *, may_command: bool, holds: bool) -> str:
         "lasers": [
             {"name": laser.name, "colour": laser_colour(i)} for i, laser in enumerate(rig.lasers)
         ],
-        "working_range_m": [near, far],
+        "working_range_m": rig.working_range,
         "may_command": may_command,
         "holds": holds,
     }
@@ -260,15 +259,7 @@ _log = logging.getLogger(__name__)
 class DashboardServer:
     """Server of page and data until it is closed.
 
-    Parameters
-    ----------
-    host, port
-        Where to listen; port 0 takes any that is free.
-
-    Raises
-    ------
-    OptionError
-        If the address cannot be listened to.
+    `port`: 0 takes any that is free. Raises `OptionError` if the address cannot be listened to.
     """
 
     def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:

@@ -61,23 +61,48 @@ def scene(rig: Rig, scan: Scan, stamp_ns: int) -> "sdk.SceneUpdate":
     What was drawn before vanishes by itself after half a second.
     """
     lifetime_s = 0.5
-    from foxglove.messages import Duration, SceneEntity, SceneUpdate
+    from foxglove import messages as sdk
 
     posture = scan.posture
     if not isinstance(posture, Posture):
-        return SceneUpdate()
-    entity = SceneEntity(
+        return sdk.SceneUpdate()
+    side, normal = posture.range, posture.normal_in_dome
+    foot = side * normal
+    # A thin square, as wide as its range, about the perpendicular's foot.
+    square = sdk.CubePrimitive(
+        pose=_pose(upright_axes(normal), foot),
+        size=sdk.Vector3(x=side, y=1e-3, z=side),
+        color=sdk.Color(**_BLUE),
+    )
+    caption = sdk.TextPrimitive(
+        pose=_pose(np.eye(3), foot),
+        billboard=True,
+        font_size=14.0,
+        scale_invariant=True,
+        color=sdk.Color(r=1.0, g=1.0, b=1.0, a=1.0),
+        text=f"{posture.range:.3f} m",
+    )
+    lines = [
+        sdk.LinePrimitive(
+            type=sdk.LinePrimitiveLineType.LineStrip,
+            pose=_pose(np.eye(3), np.zeros(3)),
+            thickness=_LINE_PX,
+            scale_invariant=True,
+            points=[sdk.Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in ends],
+            color=sdk.Color(**_GREEN),
+        )
+        for ends in laser_lines(rig.lasers, normal, scan.points)
+    ]
+    entity = sdk.SceneEntity(
         timestamp=_stamp(stamp_ns),
         frame_id=FRAME_ID,
         id="target",
-        lifetime=Duration.from_secs(lifetime_s),
-        cubes=[_target_square(posture)],
-        lines=[
-            _line(ends) for ends in laser_lines(rig.lasers, posture.normal_in_dome, scan.points)
-        ],
-        texts=[_caption(posture)],
+        lifetime=sdk.Duration.from_secs(lifetime_s),
+        cubes=[square],
+        lines=lines,
+        texts=[caption],
     )
-    return SceneUpdate(entities=[entity])
+    return sdk.SceneUpdate(entities=[entity])
 
 
 def laser_lines(
@@ -85,12 +110,7 @@ def laser_lines(
 ) -> list[FloatArray]:
     """Return the ends, shape (2, 3), of the line that each laser was seen to draw on the target.
 
-    Parameters
-    ----------
-    normal : array, shape (3,)
-        Of the target.
-    points : ScanPoints
-        Only the posture's inliers count.
+    `normal`, shape (3,): of the target. `points`: only the posture's inliers count.
     """
     found = []
     for i, laser in enumerate(lasers):
@@ -100,44 +120,6 @@ def laser_lines(
         along = mine @ np.cross(normal, laser.plane.normal)
         found.append(mine[[np.argmin(along), np.argmax(along)]])
     return found
-
-
-def _target_square(posture: Posture) -> "sdk.CubePrimitive":
-    """Return the target as a thin square, as wide as its range, about the perpendicular's foot."""
-    from foxglove.messages import Color, CubePrimitive, Vector3
-
-    side = posture.range
-    foot = posture.range * posture.normal_in_dome
-    axes = upright_axes(posture.normal_in_dome)
-    return CubePrimitive(
-        pose=_pose(axes, foot), size=Vector3(x=side, y=1e-3, z=side), color=Color(**_BLUE)
-    )
-
-
-def _caption(posture: Posture) -> "sdk.TextPrimitive":
-    from foxglove.messages import Color, TextPrimitive
-
-    return TextPrimitive(
-        pose=_pose(np.eye(3), posture.range * posture.normal_in_dome),
-        billboard=True,
-        font_size=14.0,
-        scale_invariant=True,
-        color=Color(r=1.0, g=1.0, b=1.0, a=1.0),
-        text=f"{posture.range:.3f} m",
-    )
-
-
-def _line(ends: FloatArray) -> "sdk.LinePrimitive":
-    from foxglove.messages import Color, LinePrimitive, LinePrimitiveLineType, Point3
-
-    return LinePrimitive(
-        type=LinePrimitiveLineType.LineStrip,
-        pose=_pose(np.eye(3), np.zeros(3)),
-        thickness=_LINE_PX,
-        scale_invariant=True,
-        points=[Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in ends],
-        color=Color(**_GREEN),
-    )
 
 
 def _transform(
@@ -189,6 +171,9 @@ _TRANSFORMS, _SCENE = "/aqualvs/transforms", "/aqualvs/scene"
 class FoxgloveOutput(Output):
     """Server of posture, points, picture, scene and health to any number of viewers.
 
+    Raises `OptionError` if foxglove-sdk is not installed. Raises `OutputError` if the address
+    cannot be used.
+
     Parameters
     ----------
     host : str
@@ -200,13 +185,6 @@ class FoxgloveOutput(Output):
         Options that the postures are measured with; shown beside the rig.
     picture_hz, points_hz : float
         Most pictures, and point clouds, per second; 0 for none.
-
-    Raises
-    ------
-    OptionError
-        If foxglove-sdk is not installed.
-    OutputError
-        If the address cannot be used.
     """
 
     name = "foxglove"

@@ -26,14 +26,8 @@ would mean to PX4 that the way is free."""
 _NAN = float("nan")
 
 NAMES = (
-    "aq_valid",
-    "aq_range",
-    "aq_pitch",
-    "aq_yaw",
-    "aq_s_range",
-    "aq_s_pitch",
-    "aq_s_yaw",
-    "aq_n",
+    *("aq_valid", "aq_range", "aq_pitch", "aq_yaw"),
+    *("aq_s_range", "aq_s_pitch", "aq_s_yaw", "aq_n"),
 )
 """`NAMED_VALUE_FLOAT` of every sample: 1 or 0; range (mm) and angles (degrees), their standard
 deviations by frame and rig together, and the water's refractive index. NaN where there is no
@@ -47,17 +41,9 @@ range in mm/s. NaN where the filter has no value."""
 class MavlinkOutput(Output):
     """Output by `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
 
-    Parameters
-    ----------
-    link : MavlinkLink, Address or str
-        A link that others use too, which is not closed here, or what `MavlinkLink` takes.
-    options : LinkOptions, optional
-        Where the link is made here.
-
-    Raises
-    ------
-    OptionError
-        If the address makes no sense, or pymavlink is not installed.
+    `link`: one that others use too, which is not closed here, or what `MavlinkLink` takes together
+    with `options`. Raises `OptionError` if the address makes no sense, or pymavlink is not
+    installed.
     """
 
     inline = True
@@ -166,14 +152,11 @@ def _fill_distance(message: Any, time_boot_ms: int, sample: LiveSample) -> None:
     message.min_distance, message.max_distance = distance_limits_cm(sample.rig.working_range)
     posture = sample.scan.posture
     current_cm = round(100.0 * posture.range) if posture and math.isfinite(posture.range) else 0
+    values = _INVALID_CM, _UNKNOWN_VARIANCE, _INVALID_QUALITY
     if posture and 0 < current_cm <= _MAX_CM:
-        message.current_distance = current_cm
-        message.covariance = variance_cm2(float(posture.total_covariance[0, 0]))
-        message.signal_quality = signal_quality(sample.scan.points)
-        return
-    message.current_distance = _INVALID_CM
-    message.covariance = _UNKNOWN_VARIANCE
-    message.signal_quality = _INVALID_QUALITY
+        variance = variance_cm2(float(posture.total_covariance[0, 0]))
+        values = current_cm, variance, signal_quality(sample.scan.points)
+    message.current_distance, message.covariance, message.signal_quality = values
 
 
 def _value_messages(dialect: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
@@ -192,28 +175,16 @@ def _fill(messages: tuple[Any, ...], time_boot_ms: int, numbers: tuple[float, ..
 def _numbers(posture: Posture | Refusal, n_water: float) -> tuple[float, ...]:
     """Return what `NAMES` names."""
     if not isinstance(posture, Posture):
-        return (0.0, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, n_water)
+        return (0.0, *6 * (_NAN,), n_water)
     sigma_range, sigma_pitch, sigma_yaw = deviations(posture.total_covariance)
-    return (
-        1.0,
-        1e3 * posture.range,
-        math.degrees(posture.pitch),
-        math.degrees(posture.yaw),
-        1e3 * sigma_range,
-        sigma_pitch,
-        sigma_yaw,
-        n_water,
-    )
+    pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
+    sigmas = 1e3 * sigma_range, sigma_pitch, sigma_yaw
+    return (1.0, 1e3 * posture.range, pitch, yaw, *sigmas, n_water)
 
 
 def _filtered_numbers(filtered: FilteredPosture | None) -> tuple[float, ...]:
     """Return what `FILTERED_NAMES` names."""
     if filtered is None:
-        return (0.0, _NAN, _NAN, _NAN, _NAN)
-    return (
-        1.0,
-        1e3 * filtered.range,
-        math.degrees(filtered.pitch),
-        math.degrees(filtered.yaw),
-        1e3 * float(filtered.rates[0]),
-    )
+        return (0.0, *4 * (_NAN,))
+    pitch, yaw = math.degrees(filtered.pitch), math.degrees(filtered.yaw)
+    return (1.0, 1e3 * filtered.range, pitch, yaw, 1e3 * float(filtered.rates[0]))

@@ -21,17 +21,9 @@ _CHECK_EVERY_S, _REACH_S = 1.0, 0.3
 class RerunOutput(Output):
     """Output to Rerun; a viewer that is absent or leaves is looked for once a second.
 
-    Parameters
-    ----------
-    where : str
-        `viewer` to open one, HOST:PORT of one that is open, or a file that ends in `.rrd`.
-
-    Raises
-    ------
-    OptionError
-        If rerun-sdk is not installed, or `where` is none of these.
-    OutputError
-        If the file exists or cannot be written.
+    `where`: `viewer` to open one, HOST:PORT of one that is open, or a file that ends in `.rrd`.
+    Raises `OptionError` if rerun-sdk is not installed, or it is none of these. Raises `OutputError`
+    if the file exists or cannot be written.
     """
 
     name = "rerun"

@@ -17,7 +17,7 @@ import threading
 import xmlrpc.client
 import xmlrpc.server
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -48,21 +48,9 @@ _log = logging.getLogger(__name__)
 class Ros1Node:
     """ROS 1 node that publishes topics; registers with roscore whenever that is there.
 
-    Parameters
-    ----------
-    name : str
-        Full name, such as `/aqualvs`.
-    topics : mapping
-        Type of each topic by its full name.
-    master_uri : str
-        Where roscore is.
-    environment : mapping
-        `ROS_HOSTNAME` or `ROS_IP`: the name that subscribers reach this machine by.
-
-    Raises
-    ------
-    OptionError
-        If `master_uri` is no address.
+    `name`: the full one, such as `/aqualvs`. `topics`: type of each topic by its full name.
+    `master_uri`: where roscore is. `environment`: with `ROS_HOSTNAME` or `ROS_IP`, the name that
+    subscribers reach this machine by. Raises `OptionError` if `master_uri` is no address.
     """
 
     def __init__(
@@ -78,8 +66,8 @@ class Ros1Node:
         self._fault, self._ended = "not registered yet", ""
         at = "127.0.0.1" if _is_loopback(self._host) else "0.0.0.0"
         self.links = Ros1Links(at, name, topics)
-        self._server = _Server(at, _SlaveApi(self))
-        self.uri = f"http://{self._host}:{self._server.port}/"
+        self._server = _Server(at, self)
+        self.uri = f"http://{self._host}:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._stay_registered, name="ros1 node", daemon=True)
         self._thread.start()
 
@@ -146,13 +134,29 @@ class Ros1Node:
             _log.info("roscore went before %s: %s", self.name, fault)
 
 
-class _SlaveApi:
-    """Slave API of the node for roscore and subscribers; answers are (code, message, value)."""
+class _QuietHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
+    rpc_paths = ("/", "/RPC2")
+    timeout = 5.0
 
-    def __init__(self, node: Ros1Node) -> None:
+
+class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
+    """Slave API of a node for roscore and subscribers; each call is in a daemon thread.
+
+    Answers are (code, message, value).
+    """
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, host: str, node: Ros1Node) -> None:
+        super().__init__((host, 0), _QuietHandler, logRequests=False)
         self._node = node
+        self._thread = threading.Thread(
+            target=self.serve_forever, args=(0.1,), name="ros1 calls", daemon=True
+        )
+        self._thread.start()
 
-    def _dispatch(self, method: str, params: tuple[Any, ...]) -> list[Any]:
+    def _dispatch(self, method: str, params: Iterable[Any]) -> Any:
         """Answer a call."""
         node = self._node
         match method, *params:
@@ -184,30 +188,6 @@ class _SlaveApi:
         if not any(protocol and protocol[0] == "TCPROS" for protocol in protocols):
             return [0, "TCPROS only", []]
         return [1, "ready", self._node.tcpros]
-
-
-class _QuietHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
-    rpc_paths = ("/", "/RPC2")
-    timeout = 5.0
-
-
-class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
-    """Server of calls, each in a daemon thread."""
-
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, host: str, api: _SlaveApi) -> None:
-        super().__init__((host, 0), _QuietHandler, logRequests=False)
-        self.register_instance(api)
-        self._thread = threading.Thread(
-            target=self.serve_forever, args=(0.1,), name="ros1 calls", daemon=True
-        )
-        self._thread.start()
-
-    @property
-    def port(self) -> int:
-        return int(self.server_address[1])
 
     def handle_error(self, *_: object) -> None:
         """Take note of a caller that went away or talked nonsense, and no more."""
@@ -292,19 +272,10 @@ _NODE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 class Ros1Output(Output):
     """Publisher of ROS 1 topics, whether ROS is installed on this machine or not.
 
-    Parameters
-    ----------
-    master_uri : str or None
-        Where roscore is. None for `ROS_MASTER_URI`, this machine where that is not set.
-    node_name : str
-        A node of the same name is ended by ROS.
-    environment : mapping
-        For `ROS_MASTER_URI`, `ROS_HOSTNAME` and `ROS_IP`.
-
-    Raises
-    ------
-    OptionError
-        If the address of roscore or the node's name is none, or rosbags is not installed.
+    `master_uri`: where roscore is; None for `ROS_MASTER_URI`, this machine where that is not set.
+    `node_name`: a node of the same name is ended by ROS. `environment`: for `ROS_MASTER_URI`,
+    `ROS_HOSTNAME` and `ROS_IP`. Raises `OptionError` if the address of roscore or the node's name
+    is none, or rosbags is not installed.
     """
 
     name = "ros1"

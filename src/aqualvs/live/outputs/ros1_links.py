@@ -72,16 +72,10 @@ class _Link:
 
 
 class Ros1Links:
-    """Server of the subscribers of some topics.
+    """Server of the subscribers of some topics, on any free port.
 
-    Parameters
-    ----------
-    host : str
-        Address to listen at, on any free port.
-    caller : str
-        Full name of the node.
-    topics : mapping
-        Type of each topic by its full name.
+    `host`: address to listen at. `caller`: full name of the node. `topics`: type of each topic by
+    its full name.
     """
 
     def __init__(self, host: str, caller: str, topics: Mapping[str, Ros1Type]) -> None:

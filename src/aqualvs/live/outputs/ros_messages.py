@@ -77,12 +77,8 @@ def plane_pose(distance: float, pitch: float, yaw: float, covariance: FloatArray
     normal the covariance has `UNOBSERVABLE_VARIANCE`, so that an estimator that takes the pose for
     that of a fixed mark learns nothing from it there.
 
-    Parameters
-    ----------
-    distance, pitch, yaw : float
-        Range and angles as in `Posture`, in metres and radians.
-    covariance : array, shape (3, 3)
-        Of (range, pitch, yaw).
+    `distance`, `pitch`, `yaw`: as in `Posture`, in metres and radians; with their covariance, shape
+    (3, 3).
     """
     turn = flu_angles(pitch, yaw)
     rotation = _rotation(*turn)
@@ -367,12 +363,7 @@ class Level(IntEnum):
     ERROR = 2
 
 
-_LEVELS = {
-    State.OK: Level.OK,
-    State.OFF: Level.OK,
-    State.WARN: Level.WARN,
-    State.FAULT: Level.ERROR,
-}
+_LEVELS = {State.WARN: Level.WARN, State.FAULT: Level.ERROR}
 
 
 def _diagnostics(types: RosTypes, sample: LiveSample) -> Any:
@@ -460,7 +451,7 @@ def _part_status(part: PartHealth) -> _Status:
     if part.state is State.OFF:
         text = f"not in use: {text}" if text else "not in use"
     figures = {"state": str(part.state), "n_dropped": str(part.n_dropped)}
-    return _LEVELS[part.state], text, figures
+    return _LEVELS.get(part.state, Level.OK), text, figures
 
 
 def _figure_texts(**figures: float) -> dict[str, str]:

@@ -29,20 +29,11 @@ _POSTURE_KEYS = tuple(
     name for name in POSTURE_COLUMNS[POSTURE_COLUMNS.index("range_m") :] if name != "n_water"
 )
 _FILTERED_KEYS = (
-    "filtered_range_m",
-    "filtered_pitch_deg",
-    "filtered_yaw_deg",
-    "filtered_sigma_range_m",
-    "filtered_sigma_pitch_deg",
-    "filtered_sigma_yaw_deg",
-    "filtered_speed_m_per_s",
-    "filtered_pitch_rate_deg_per_s",
-    "filtered_yaw_rate_deg_per_s",
-    "filtered_age_s",
-    "filtered_accepted",
-    "filtered_sigma_range_total_m",
-    "filtered_sigma_pitch_total_deg",
-    "filtered_sigma_yaw_total_deg",
+    *("filtered_range_m", "filtered_pitch_deg", "filtered_yaw_deg"),
+    *("filtered_sigma_range_m", "filtered_sigma_pitch_deg", "filtered_sigma_yaw_deg"),
+    *("filtered_speed_m_per_s", "filtered_pitch_rate_deg_per_s", "filtered_yaw_rate_deg_per_s"),
+    *("filtered_age_s", "filtered_accepted", "filtered_sigma_range_total_m"),
+    *("filtered_sigma_pitch_total_deg", "filtered_sigma_yaw_total_deg"),
 )
 
 
