@@ -66,7 +66,7 @@ def test_the_log_half_a_second_off_does_not_lie_on_the_dive(scenario, log_file):
     times = np.array(list(scenario.times()))
     normals = np.array([scenario.scene_at(t).target_plane().normal for t in times])
     yaw = np.arctan2(normals[:, 0], normals[:, 1])
-    places = VehiclePlaces(read_vehicle_log(log_file), LEAD_S + 0.5).at(times, yaw)
+    places = VehiclePlaces(read_vehicle_log(log_file), LEAD_S + 0.5).at(times, yaw, 0.0)
     assert np.rad2deg(np.std(places.bearing)) > 1.0
 
 

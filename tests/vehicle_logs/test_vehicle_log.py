@@ -232,18 +232,18 @@ def test_a_scene_gives_back_where_its_net_hangs(
 
 
 def test_level_the_net_bears_heading_plus_yaw() -> None:
-    places = VehiclePlaces(log_of(math.radians(350.0), 0.0, 0.0)).at([0.0], [math.radians(15.0)])
+    log = log_of(math.radians(350.0), 0.0, 0.0)
+    places = VehiclePlaces(log).at([0.0], [math.radians(15.0)], [0.0])
     assert math.degrees(places.bearing[0]) == pytest.approx(5.0)
-    assert not places.lean_valid.any()
 
 
 def test_places_are_masked_where_log_or_posture_does_not_tell() -> None:
     places = VehiclePlaces(log_of(1.0, 0.0, 0.0), -1.0)
-    at = places.at([0.5, 2.0, 3.0, 4.0], [0.1, 0.1, math.nan, 0.1], valid=[1, 1, 1, 0])
+    at = places.at([0.5, 2.0, 3.0, 4.0], [0.1, 0.1, math.nan, 0.1], 4 * [0.0], [1, 1, 1, 0])
     assert at.depth_valid.tolist() == [False, True, True, True]
     assert at.bearing_valid.tolist() == [False, True, False, False]
     assert np.isfinite(at.bearing).tolist() == at.bearing_valid.tolist()
-    assert not places.at([2.0]).bearing_valid.any()
+    assert not places.at([2.0], [0.1], [math.nan]).bearing_valid.any()
 
 
 def test_without_attitude_the_vehicle_counts_as_level() -> None:

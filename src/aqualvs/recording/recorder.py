@@ -237,8 +237,10 @@ class Recorder:
                 self._fault = ""
                 self._sync_if_due()
                 return True
-            if self._must_end():
-                return False
+            # A closing recorder tries no more.
+            with self._changed:
+                if self._changed.wait_for(lambda: self._closing, _RETRY_S):
+                    return False
 
     def _sync_if_due(self) -> None:
         """Flush the file to the disk if the interval has passed."""
@@ -250,11 +252,6 @@ class Recorder:
             self._file.sync()
         except OSError as fault:
             self._fault = _fault_text(fault)
-
-    def _must_end(self) -> bool:
-        """Wait before a retry; return whether the recording is being closed."""
-        with self._changed:
-            return self._closing or self._changed.wait_for(lambda: self._closing, _RETRY_S)
 
 
 def _fault_text(fault: OSError) -> str:

@@ -137,7 +137,10 @@ class RerunLog(Closing):
     def _log_styles(self) -> None:
         rr = self._rr
         labels = [
-            rr.AnnotationInfo(int(one), LABEL_WORDS[one], _rgb(LABEL_COLOURS[one])) for one in Label
+            rr.AnnotationInfo(
+                int(one), LABEL_WORDS[one], tuple(bytes.fromhex(LABEL_COLOURS[one].lstrip("#")))
+            )
+            for one in Label
         ]
         self._log_static(_TARGET, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._log_static(_TARGET, rr.AnnotationContext(labels))
@@ -242,8 +245,3 @@ def _blueprint() -> Any:
         ),
         collapse_panels=True,
     )
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
-    return red, green, blue

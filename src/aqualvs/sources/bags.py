@@ -13,6 +13,7 @@ import itertools
 import shutil
 import struct
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -85,11 +86,11 @@ def _source(
 
 
 def _image_topics(path: Path) -> list[ImageTopic]:
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     with _opened(path) as reader:
         for connection in reader.connections:
             if holds_images(connection.msgtype):
-                counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+                counts[connection.topic] += connection.msgcount
     return [ImageTopic(name, n) for name, n in counts.items()]
 
 

@@ -88,22 +88,19 @@ def _listen(address: UdpAddress) -> socket.socket:
         if host is not None and host.is_multicast:
             made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             made.bind(("", address.port))
-            _join(made, address.host, is_v6=family == socket.AF_INET6)
+            if isinstance(host, IPv6Address):
+                group = host.packed + struct.pack("@I", 0)
+                made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, group)
+            else:
+                # On any interface.
+                group = host.packed + bytes(4)
+                made.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
         else:
             made.bind((address.host, address.port))
     except BaseException:
         made.close()
         raise
     return made
-
-
-def _join(made: socket.socket, group: str, *, is_v6: bool) -> None:
-    if is_v6:
-        request = socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", 0)
-        made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, request)
-    else:
-        request = struct.pack("4s4s", socket.inet_aton(group), socket.inet_aton("0.0.0.0"))
-        made.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
 
 
 RTP, TS, BARE = "RTP H.264", "MPEG-TS", "bare H.264"

@@ -97,7 +97,6 @@ class NalType(IntEnum):
     IDR = 5
     SEI = 6
     SPS = 7
-    PPS = 8
     DELIMITER = 9
 
 
@@ -251,9 +250,11 @@ def _slice_form(unit: bytes) -> _SliceForm | None:
     bits.golomb()
     if profile in _CHROMA_PROFILES and not _skip_chroma(bits):
         return None
-    width = bits.golomb() + 4
-    if width > 16 or not _skip_order(bits):
-        return None
+    width, order = bits.golomb() + 4, bits.golomb()
+    if width > 16 or order == 1:
+        return None  # Fields of the picture order's rare type 1 follow.
+    if order == 0:
+        bits.golomb()
     bits.golomb()
     may_skip_numbers = bool(bits.read(1))
     for _ in range(2):  # pic_width_in_mbs_minus1, pic_height_in_map_units_minus1
@@ -269,11 +270,3 @@ def _skip_chroma(bits: _Bits) -> bool:
     bits.golomb()
     bits.read(1)
     return not bits.read(1)  # Scaling matrices follow.
-
-
-def _skip_order(bits: _Bits) -> bool:
-    """Skip the fields of the picture order; return False for its rare type 1."""
-    kind = bits.golomb()
-    if kind == 0:
-        bits.golomb()
-    return kind != 1

@@ -383,14 +383,18 @@ class MessageSource(Closing):
         return size, (last - first) / (ended - began) if ended > began else None
 
     def _frames(self) -> Iterator[Frame]:
-        decoder = _Decoder(self._planes)
-        clock, shown = _Clock(), -1
+        decoder, shown = _Decoder(self._planes), -1
+        # Times since the first image, which never fall, of the last images by their index.
+        first_ns, time_s, times_s = None, 0.0, {}
         for index, (log_ns, message) in enumerate(self._messages()):
             if message is not None:
-                clock.note(index, message.stamp_ns or log_ns)
+                time_ns = message.stamp_ns or log_ns
+                first_ns = time_ns if first_ns is None else first_ns
+                time_s = times_s[index] = max(time_s, 1e-9 * (time_ns - first_ns))
+                times_s.pop(index - 64, None)
                 for frame in decoder.decode(index, message):
                     shown = index
-                    yield replace(frame, time_s=clock.time(frame.index))
+                    yield replace(frame, time_s=times_s.get(frame.index, time_s))
             if index - shown > _MAX_UNREADABLE:
                 raise SourceError(
                     f"{self.name}: {index - shown} messages in a row hold no image that can be "
@@ -405,25 +409,6 @@ class MessageSource(Closing):
                 f"known are {', '.join(ENCODINGS)}"
             )
         return planes_of_message(message)
-
-
-class _Clock:
-    """Clock of a topic: times since the first image, which never fall."""
-
-    def __init__(self) -> None:
-        self._first_ns: int | None = None
-        self._last = 0.0
-        self._times: dict[int, float] = {}
-
-    def note(self, index: int, time_ns: int) -> None:
-        if self._first_ns is None:
-            self._first_ns = time_ns
-        self._last = max(self._last, 1e-9 * (time_ns - self._first_ns))
-        self._times[index] = self._last
-        self._times.pop(index - 64, None)
-
-    def time(self, index: int) -> float:
-        return self._times.get(index, self._last)
 
 
 class _Decoder:

@@ -33,8 +33,7 @@ def quiet_decoders() -> Iterator[None]:
     global _n_inside, _before
     with _lock:
         if _n_inside == 0:
-            level = cv2.utils.logging.setLogLevel(0)
-            _before = _discard_stderr(), level
+            _before = _discard_stderr(), cv2.utils.logging.setLogLevel(0)
         _n_inside += 1
     try:
         yield

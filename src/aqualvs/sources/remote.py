@@ -116,6 +116,8 @@ class RemoteFeed:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until closed; connects anew when the stream breaks off."""
+        # Pauses before retries, the last one repeated: the vehicle may return at any time.
+        retry_s = (0.1, 0.2, 0.5)
         n_failed = 0
         while not self._closed.is_set():
             connection = self._connection = Connection(self._opener)
@@ -133,7 +135,9 @@ class RemoteFeed:
             finally:
                 connection.abandon()
             n_failed = 0 if n_packets else n_failed + 1
-            self._wait_before_retry(connection, n_failed)
+            if not self._closed.is_set():
+                self._reception.note_fault(f"no connection ({connection.reason}); trying again")
+                self._closed.wait(retry_s[min(n_failed, len(retry_s) - 1)])
 
     def health(self) -> PartHealth:
         """Return how the stream is."""
@@ -145,15 +149,6 @@ class RemoteFeed:
         self._reception.end("closed")
         if self._connection is not None:
             self._connection.abandon()
-
-    def _wait_before_retry(self, connection: Connection, n_failed: int) -> None:
-        """Report why there is no connection, and wait a little."""
-        if self._closed.is_set():
-            return
-        self._reception.note_fault(f"no connection ({connection.reason}); trying again")
-        # Pauses before retries, the last one repeated: the vehicle may return at any time.
-        retry_s = (0.1, 0.2, 0.5)
-        self._closed.wait(retry_s[min(n_failed, len(retry_s) - 1)])
 
 
 def remote_feed(address: str, *, transport: Transport = "tcp") -> RemoteFeed:
@@ -222,7 +217,9 @@ class CameraFeed(RemoteFeed):
                 f"{self._device}: cameras are read on Linux only; send the picture by RTSP"
             )
         if not Path(self._device).exists():
-            raise SourceError(f"{self._device}: no such camera; {_present_cameras()}")
+            found = ", ".join(sorted(str(path) for path in _DEVICES.glob("video*")))
+            present = f"there is {found}" if found else "no camera is plugged in"
+            raise SourceError(f"{self._device}: no such camera; {present}")
         return super().__iter__()
 
 
@@ -240,8 +237,3 @@ def camera_device(where: str) -> str:
 def is_camera(where: str) -> bool:
     """Return whether `where` names a camera."""
     return where.startswith(("camera:", f"{_DEVICES}/video", f"{_DEVICES}/v4l/"))
-
-
-def _present_cameras() -> str:
-    found = sorted(str(path) for path in _DEVICES.glob("video*"))
-    return f"there is {', '.join(found)}" if found else "no camera is plugged in"

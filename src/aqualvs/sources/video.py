@@ -313,13 +313,11 @@ class VideoSource(Closing):
                 f"{self.name}: the picture size changes from {self.size_px[0]}x{self.size_px[1]} "
                 f"to {picture.width}x{picture.height} px at frame {index}; cut the video there"
             )
-        return frame_of(index, self._time_of(picture, index), picture)
-
-    def _time_of(self, picture: VideoFrame, index: int) -> float:
-        """Return seconds since the start of the stream, by its own clock where it has one."""
-        if picture.pts is None or self._tick is None:
-            return index / (self.fps or 1.0)
-        return float((picture.pts - (self._frame_counter.first_pts or 0)) * self._tick)
+        # Since the start of the stream, by its own clock where it has one.
+        time_s = index / (self.fps or 1.0)
+        if picture.pts is not None and self._tick is not None:
+            time_s = float((picture.pts - (self._frame_counter.first_pts or 0)) * self._tick)
+        return frame_of(index, time_s, picture)
 
     def _check_complete(self) -> None:
         """Raise if the file ended before its promise, or if its last frames are lost."""
@@ -408,18 +406,15 @@ def _open(where: str) -> InputContainer:
     except FileNotFoundError as fault:
         raise SourceError(f"{where}: no such file; check the path") from fault
     except (av.error.InvalidDataError, av.error.EOFError) as fault:
-        raise SourceError(_not_a_video(where)) from fault
+        path = Path(where)
+        if path.is_file() and path.stat().st_size == 0:
+            what = "the file is empty (0 bytes)"
+            raise SourceError(f"{where}: {what}; copy it again from the recorder") from fault
+        raise SourceError(
+            f"{where}: not a video, or cut short before its index was written; "
+            "check the file or copy it again from the recorder"
+        ) from fault
     except av.error.ExitError as fault:
         raise SourceError(f"{where}: nothing came in {_STALL_S:g} s; is the sender on?") from fault
     except (av.error.FFmpegError, OSError) as fault:
         raise SourceError(f"{where}: cannot be opened ({fault.strerror})") from fault
-
-
-def _not_a_video(where: str) -> str:
-    path = Path(where)
-    if path.is_file() and path.stat().st_size == 0:
-        return f"{where}: the file is empty (0 bytes); copy it again from the recorder"
-    return (
-        f"{where}: not a video, or cut short before its index was written; "
-        "check the file or copy it again from the recorder"
-    )

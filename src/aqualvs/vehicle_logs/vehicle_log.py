@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.planes import normals_of
 
 _TURN = 2.0 * math.pi
 
@@ -247,11 +248,7 @@ class VehiclePlaces:
             )
 
     def at(
-        self,
-        time_s: ArrayLike,
-        yaw: ArrayLike | None = None,
-        pitch: ArrayLike | None = None,
-        valid: ArrayLike | None = None,
+        self, time_s: ArrayLike, yaw: ArrayLike, pitch: ArrayLike, valid: ArrayLike | None = None
     ) -> Places:
         """Return depth, heading and orientation of vehicle and net at dive times.
 
@@ -259,9 +256,8 @@ class VehiclePlaces:
         ----------
         time_s : array, shape (n,)
             Dive time.
-        yaw, pitch : array, shape (n,), optional
-            Posture to the net (paper, Eq. 24-26) at those times. Without yaw there is no bearing;
-            without pitch, a pitch of 0 is assumed.
+        yaw, pitch : array, shape (n,)
+            Posture to the net (paper, Eq. 24-26) at those times.
         valid : bool array, shape (n,), optional
             Where the posture is valid; wherever it is finite, if left out.
 
@@ -277,15 +273,18 @@ class VehiclePlaces:
         ned_from_dome = ned_from_dome_of(
             state.heading, np.where(level, 0.0, state.pitch), np.where(level, 0.0, state.roll)
         )
-        normal, posture_valid = _far_normals(len(times), yaw, pitch, valid)
-        normal_in_ned = np.einsum("nij,nj->ni", ned_from_dome, normal)
+        across, up = (np.broadcast_to(np.asarray(a, float), len(times)) for a in (yaw, pitch))
+        posture_valid = np.isfinite(across) & np.isfinite(up)
+        if valid is not None:
+            posture_valid &= np.broadcast_to(np.asarray(valid, bool), len(times))
+        normal_in_ned = np.einsum("nij,nj->ni", ned_from_dome, normals_of(up, across))
         north, east, down = normal_in_ned.T
         horizontal = np.hypot(north, east)
         seen = posture_valid & state.heading_valid
         # A vertical normal has no bearing.
         min_horizontal = 0.05
         bearing_valid = seen & (horizontal > min_horizontal)
-        lean_valid = seen & ~level & (pitch is not None)
+        lean_valid = seen & ~level
         return Places(
             time_s=times,
             depth=state.depth,
@@ -315,18 +314,3 @@ def ned_from_dome_of(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> F
     right = np.stack([ch * sp * sr - sh * cr, sh * sp * sr + ch * cr, cp * sr], axis=-1)
     down = np.stack([ch * sp * cr + sh * sr, sh * sp * cr - ch * sr, cp * cr], axis=-1)
     return np.stack([right, forward, -down], axis=-1)
-
-
-def _far_normals(
-    n: int, yaw: ArrayLike | None, pitch: ArrayLike | None, valid: ArrayLike | None
-) -> tuple[FloatArray, BoolArray]:
-    """Return unit far normals in `dome`, shape (n, 3), and the mask of known ones."""
-    if yaw is None:
-        return np.full((n, 3), np.nan), np.zeros(n, bool)
-    across = np.broadcast_to(np.asarray(yaw, float), n)
-    up = np.broadcast_to(np.asarray(0.0 if pitch is None else pitch, float), n)
-    known = np.isfinite(across) & np.isfinite(up)
-    if valid is not None:
-        known = known & np.broadcast_to(np.asarray(valid, bool), n)
-    normal = np.stack([np.tan(across), np.ones(n), np.tan(up)], axis=-1)
-    return normal / np.linalg.norm(normal, axis=-1, keepdims=True), known
