@@ -23,8 +23,7 @@ from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.live.command import SWITCH_S
 from aqualvs.live.dashboard.access import Access, Controls, RecordButton
-from aqualvs.live.dashboard.output import Dashboard
-from aqualvs.live.dashboard.server import DashboardServer
+from aqualvs.live.dashboard.server import Dashboard, DashboardServer
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.live.runner import LiveRunner, ScannerProvider, warm_up

@@ -27,8 +27,7 @@ from aqualvs.live.dashboard.access import (
     TokenGate,
     make_access,
 )
-from aqualvs.live.dashboard.output import Dashboard, page_picture
-from aqualvs.live.dashboard.server import DashboardServer, Hub, PageClient
+from aqualvs.live.dashboard.server import Dashboard, DashboardServer, Hub, PageClient, page_picture
 from aqualvs.live.options import host_and_port
 from aqualvs.recording import RecorderSwitch
 from aqualvs.recording.sample import LiveSample

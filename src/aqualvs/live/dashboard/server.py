@@ -1,4 +1,4 @@
-"""The web server of the pilot's page, in a thread of its own, and the state that it sends as JSON.
+"""The pilot's page as an output: its web server, and the state and pictures that it sends.
 
 `Hub` hands the latest state and picture to every open page; slow pages skip some.
 """
@@ -11,10 +11,11 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 import uvicorn
 from pydantic import ValidationError
@@ -42,13 +43,14 @@ from aqualvs.live.dashboard.access import (
     TokenGate,
     are_addresses,
 )
+from aqualvs.live.outputs.base import Output
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.files import without_nan
 from aqualvs.results.folder import posture_cells
 from aqualvs.scanning.posture import Refusal, deviations
-from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.sources.base import Health
+from aqualvs.scanning.scan import Frame, ImagePlane, Label, ScanPoints
+from aqualvs.sources.base import Health, PartHealth, State
 from aqualvs.text import laser_colour
 
 
@@ -265,14 +267,24 @@ class DashboardServer:
     def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:
         self.hub = Hub()
         self._access, self._rig, self._controls = access, rig, controls
-        self._content_policy = _content_policy(access)
+        embedders = " ".join(access.embedders) or "'none'"
+        # What the page may load, and who may show it inside a page of theirs.
+        policy = f"default-src 'self'; img-src 'self' blob: data:; frame-ancestors {embedders}"
+        self._page_headers = {**_HEADERS, "Content-Security-Policy": policy}
         self._limits, self._gate = ConnectionLimits(), TokenGate(access)
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]  # Where it listens.
         self._loop: asyncio.AbstractEventLoop | None = None
+        app = Starlette(
+            routes=[
+                Route("/register_service", _blueos, methods=["GET"]),
+                Route("/{name:path}", self._asset, methods=["GET"]),
+                WebSocketRoute("/live", self._serve_page),
+            ]
+        )
         self._server = uvicorn.Server(
             uvicorn.Config(
-                _checked_addresses(self._app()),
+                _checked_addresses(app),
                 http=self._limits.protocol(),
                 log_level="warning",
                 access_log=False,
@@ -312,22 +324,13 @@ class DashboardServer:
         self._loop = asyncio.get_running_loop()
         await self._server.serve(sockets=[self._socket])
 
-    def _app(self) -> Starlette:
-        return Starlette(
-            routes=[
-                Route("/register_service", _blueos, methods=["GET"]),
-                Route("/{name:path}", self._asset, methods=["GET"]),
-                WebSocketRoute("/live", self._serve_page),
-            ]
-        )
-
     async def _asset(self, request: Request) -> Response:
         found = _ASSETS.get(request.path_params["name"])
         if found is None:
             return PlainTextResponse("no such page\n", 404, headers=_HEADERS)
         content = (importlib.resources.files(found[2]) / "assets" / found[0]).read_bytes()
-        headers = {**_HEADERS, "Content-Security-Policy": self._content_policy}
-        return Response(content, media_type=f"{found[1]}; charset=utf-8", headers=headers)
+        media_type = f"{found[1]}; charset=utf-8"
+        return Response(content, media_type=media_type, headers=self._page_headers)
 
     async def _serve_page(self, socket: WebSocket) -> None:
         peer = socket.client.host if socket.client else "unknown"
@@ -418,12 +421,6 @@ class DashboardServer:
                 await socket.send_json({"kind": "refused", "why": str(fault)})
 
 
-def _content_policy(access: Access) -> str:
-    """Return what the page may load, and who may show it inside a page of theirs."""
-    embedders = " ".join(access.embedders) or "'none'"
-    return f"default-src 'self'; img-src 'self' blob: data:; frame-ancestors {embedders}"
-
-
 async def _send_news(socket: WebSocket, viewer: PageClient) -> None:
     while True:
         state, picture = await viewer.next()
@@ -495,3 +492,75 @@ def _listen(host: str, port: int) -> socket.socket:
         ) from fault
     listener.listen(16)
     return listener
+
+
+def page_picture(frame: Frame) -> bytes:
+    """Return the frame as a JPEG of at most 960 px width."""
+    max_width, quality = 960, 70
+    height, width = frame.luma.shape
+    # Rows of a field are two rows apart.
+    height = height if frame.field is None else 2 * height
+    scale = min(1.0, max_width / width)
+    # Even numbers: the colour planes have half the size.
+    size = (2 * round(scale * width / 2), 2 * round(scale * height / 2))
+    luma = _resized(frame.luma, size)
+    if frame.chroma is None:
+        image = luma
+    else:
+        half = (size[0] // 2, size[1] // 2)
+        planes = [luma.ravel(), *(_resized(plane, half).ravel() for plane in frame.chroma)]
+        stacked = np.concatenate(planes).reshape(size[1] * 3 // 2, size[0])
+        image = np.asarray(cv2.cvtColor(stacked, cv2.COLOR_YUV2BGR_I420), np.uint8)
+    done, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise RuntimeError("the picture could not be encoded")
+    return bytes(code)
+
+
+def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
+    if (plane.shape[1], plane.shape[0]) == size:
+        return np.ascontiguousarray(plane)
+    return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+class Dashboard(Output):
+    """Output to the open pages; costs next to nothing while there is none.
+
+    `server`: owned from here on. `vehicle`: returns what the autopilot tells of depth and heading.
+    """
+
+    name = "dashboard"
+
+    def __init__(
+        self,
+        server: DashboardServer,
+        controls: Controls,
+        vehicle: Callable[[], VehicleState | None],
+    ) -> None:
+        self._server, self._controls, self._vehicle = server, controls, vehicle
+        self._state_s = self._picture_s = 0.0
+
+    def send(self, sample: LiveSample) -> None:
+        """Send a sample, and at intervals its picture behind the number of its frame."""
+        # More than a pilot perceives; the remaining time of the machine is for the measurement.
+        state_every_s, picture_every_s = 0.04, 0.08
+        now_s = time.monotonic()
+        if not self._server.hub.n_viewers or now_s - self._state_s < 0.5 * state_every_s:
+            return
+        self._state_s = now_s
+        picture = None
+        if sample.frame is not None and now_s - self._picture_s > picture_every_s:
+            self._picture_s = now_s
+            picture = sample.frame.index.to_bytes(4, "big") + page_picture(sample.frame)
+        recording = self._controls.recorder.to_dict()
+        setpoint = self._controls.setpoint.setpoint
+        self._server.publish(page_state(sample, setpoint, recording, self._vehicle()), picture)
+
+    def health(self) -> PartHealth:
+        """Return how many pages are open."""
+        n = self._server.hub.n_viewers
+        return PartHealth(self.name, State.OK, f"{n} page{'' if n == 1 else 's'} open")
+
+    def close(self) -> None:
+        """End the server."""
+        self._server.close()
