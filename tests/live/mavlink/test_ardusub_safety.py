@@ -19,6 +19,7 @@ from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
 from aqualvs.live.mavlink.ardusub_commands import Command
+from aqualvs.live.mavlink.link import MavlinkLink
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.sources.base import State
 from repository import HELPERS
@@ -285,8 +286,9 @@ import sys, time
 sys.path.insert(0, {helpers!r})
 from fake_ardusub_cases import *
 from aqualvs.live.mavlink.ardusub import ArduSubLink
+from aqualvs.live.mavlink.link import MavlinkLink
 
-vehicle = ArduSubLink({url!r})
+vehicle = ArduSubLink(MavlinkLink({url!r}))
 holder = SetpointHolder((0.3, 2.0))
 holder.put(Setpoint(0.4))
 pilot, smooth = Pilot(steering(), vehicle, holder), PostureFilter()
@@ -319,7 +321,8 @@ def test_killed_process_leaves_the_vehicle_to_its_own_fail_safe(fake: Fake) -> N
 def test_signs(fake: Fake, command: Command) -> None:
     """Forward, right, down and clockwise are positive, from the effort to the motion."""
     fake.play(mode=2 if command is Command.STICKS else 4)
-    vehicle = ArduSubLink(fake.url, ArduSubOptions(command=command))
+    link = MavlinkLink(fake.url)
+    vehicle = ArduSubLink(link, ArduSubOptions(command=command))
     try:
         until(lambda: vehicle.state().mode == "ours", "a vehicle")
         for name, measured, sign in (
@@ -341,6 +344,7 @@ def test_signs(fake: Fake, command: Command) -> None:
             assert all(abs(moved[key]) < 0.005 for key in moved.keys() - others), (name, moved)
     finally:
         vehicle.close()
+        link.close()
 
 
 def steer_until(vehicle: ArduSubLink, effort: Effort, done: Callable[[], bool]) -> None:

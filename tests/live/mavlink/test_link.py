@@ -301,7 +301,7 @@ def test_a_serial_line_that_is_unplugged(lab: Lab, tmp_path: Path) -> None:
 def test_a_slow_line_carries_the_distance_first(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from aqualvs.live.mavlink.serial import SerialPort
+    from aqualvs.live.mavlink.ports import SerialPort
 
     peer = lab.peer(f"pty:{tmp_path / 'ttyACM0'}")
     output = lab.output(f"serial:{tmp_path / 'ttyACM0'}")

@@ -262,21 +262,15 @@ class ArduSubOptions:
 class ArduSubLink:
     """A vehicle with ArduSub, as `aqualvs.control.vehicle.VehicleLink`.
 
-    `link`: address as in `parse_address`, or a link that others use too, which is not closed here.
-    `advises`: whether settings of the vehicle that are not safe are logged. Raises `OptionError` if
-    the address makes no sense, or pymavlink is not installed.
+    `link`: is not closed here: others use it too. `advises`: whether settings of the vehicle that
+    are not safe are logged.
     """
 
     def __init__(
-        self,
-        link: str | MavlinkLink,
-        options: ArduSubOptions | None = None,
-        *,
-        advises: bool = True,
+        self, link: MavlinkLink, options: ArduSubOptions | None = None, *, advises: bool = True
     ) -> None:
         self.options = options or ArduSubOptions()
-        self._owns_link = isinstance(link, str)
-        self.link = MavlinkLink(link) if isinstance(link, str) else link
+        self.link = link
         self.name = f"ArduSub {self.link.url}"
         # Not a ground station's own component (190 as a rule): a router would take the two for one,
         # and keep its messages from us.
@@ -343,7 +337,7 @@ class ArduSubLink:
             raise OSError(f"{self.name}: not sent; {self.link.health().detail}")
 
     def close(self) -> None:
-        """Send neutral, if efforts may still be in force, and free everything."""
+        """Send neutral, if efforts may still be in force; further calls do nothing."""
         # Sticks used within this time may still be in force when the link is closed.
         lately_s = 3.0
         goodbyes, goodbye_every_s = 3, 0.02
@@ -355,8 +349,6 @@ class ArduSubLink:
                 with contextlib.suppress(OSError):
                     self._send(NEUTRAL)
                 time.sleep(goodbye_every_s)
-        if self._owns_link:
-            self.link.close()
 
     def _send(self, effort: Effort) -> bool:
         with self._sending:
@@ -403,18 +395,14 @@ class ArduSubLink:
             return Mode.PILOT, name
         if self.link.conflict:
             return Mode.CONFLICT, f"{name}; {self.link.conflict}"
-        if self._is_ignored(parameters):
-            advice = advise_on_station(parameters, self.options.ground_station)
-            return Mode.IGNORED, f"{name}; {advice.sentence}"
+        obeyed, station = StationRange(parameters), self.options.ground_station
+        by_sticks = self.options.command is Command.STICKS
+        if by_sticks and obeyed.known and station not in obeyed:
+            # The vehicle has reported that it takes only others' sticks.
+            return Mode.IGNORED, f"{name}; {advise_on_station(parameters, station).sentence}"
         if not self._is_supervised():
             return Mode.NO_STATION, f"{name}; {self._missing_station()}"
         return Mode.OURS, name
-
-    def _is_ignored(self, parameters: dict[str, float]) -> bool:
-        """Return whether the vehicle has reported that it takes only others' sticks."""
-        obeyed = StationRange(parameters)
-        by_sticks = self.options.command is Command.STICKS
-        return by_sticks and obeyed.known and self.options.ground_station not in obeyed
 
     def _is_supervised(self) -> bool:
         """Return whether the ground station is there, or need not be."""

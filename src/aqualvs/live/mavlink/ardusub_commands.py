@@ -79,11 +79,11 @@ class StickResponse:
                 share, pulse_us = getattr(sticks, axis) / FULL, getattr(message, channel)
                 # 0 and 65535 mean an unused channel.
                 off_us = pulse_us - CENTRE_US if MIN_US < pulse_us < MAX_US else 0
-                self._channels[channel].add(now_s, share, float(off_us))
+                self._channels[channel].append((now_s, share, float(off_us)))
         message = self._new_message("ATTITUDE")
         turn = sticks.r / FULL
         if message is not None and abs(turn) >= _TURNING_STICK:
-            self._turns.add(now_s, turn, float(message.yawspeed))
+            self._turns.append((now_s, turn, float(message.yawspeed)))
 
     def _new_message(self, kind: str) -> Any:
         found = self._link.latest(kind, system=self._link.system)
@@ -93,30 +93,19 @@ class StickResponse:
         return found.message
 
 
-class _Pairs:
-    """Stick positions and the vehicle's responses to them, over the last seconds."""
-
-    def __init__(self) -> None:
-        self._pairs: deque[tuple[float, float, float]] = deque()
-
-    def add(self, now_s: float, share: float, answer: float) -> None:
-        """Add a pair."""
-        self._pairs.append((now_s, share, answer))
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._pairs.clear()
+class _Pairs(deque[tuple[float, float, float]]):
+    """Times, stick positions and the vehicle's responses to them, over the last seconds."""
 
     def since(self, now_s: float) -> list[tuple[float, float]]:
         """Return the pairs of the window that ends now; older ones are forgotten."""
-        while self._pairs and now_s - self._pairs[0][0] > _WINDOW_S:
-            self._pairs.popleft()
-        return [(share, answer) for _, share, answer in self._pairs]
+        while self and now_s - self[0][0] > _WINDOW_S:
+            self.popleft()
+        return [(share, answer) for _, share, answer in self]
 
     @property
     def swing(self) -> float:
         """Greatest answer less the least."""
-        answers = [answer for _, _, answer in self._pairs]
+        answers = [answer for _, _, answer in self]
         return max(answers, default=0.0) - min(answers, default=0.0)
 
 

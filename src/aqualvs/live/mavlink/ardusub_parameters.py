@@ -121,9 +121,10 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> Iterator[Finding]:
             f"{PILOT_INPUT} 1"
         )
     elif round(action) == disarm:
+        after = PILOT_TIMEOUT if timeout_s is None else f"{timeout_s:g} s"
         yield Finding.warn(
             f"{PILOT_INPUT} 2 (disarm): without a joystick that sends, the vehicle disarms "
-            f"{_seconds(timeout_s)} after Enter gives it back, and sinks if it is heavy; set "
+            f"{after} after Enter gives it back, and sinks if it is heavy; set "
             f"{PILOT_INPUT} 1, or leave the joystick on"
         )
     else:
@@ -219,7 +220,3 @@ def _first(
     """Return the first name with a reported value, and the value in metres."""
     known = ((name, unit * parameters[name]) for name, unit in names if name in parameters)
     return next(known, None)
-
-
-def _seconds(timeout_s: float | None) -> str:
-    return PILOT_TIMEOUT if timeout_s is None else f"{timeout_s:g} s"

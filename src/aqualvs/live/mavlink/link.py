@@ -346,14 +346,11 @@ class MavlinkLink:
             for _, ready in selector.select(min(_LOOK_EVERY_S, max(0.0, beat_s - now_s))):
                 if ready & selectors.EVENT_READ:
                     self._read(port)
-            self._flush(port)
+            with self._sending:
+                port.flush()
+                if self._broken is not None:
+                    raise self._broken
             self._check_silence(opened_s)
-
-    def _flush(self, port: Port) -> None:
-        with self._sending:
-            port.flush()
-            if self._broken is not None:
-                raise self._broken
 
     def _check_silence(self, opened_s: float) -> None:
         """Raise if the peer was heard once and has been silent long, to look it up anew."""

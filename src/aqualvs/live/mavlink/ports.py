@@ -1,12 +1,17 @@
 """Addresses and ports of MAVLink peers: UDP, TCP and serial lines, all non-blocking.
 
-Addresses have the forms that pymavlink and ground stations use (`parse_address`).
+Addresses have the forms that pymavlink and ground stations use (`parse_address`). Serial ports are
+those of pyserial: Linux, macOS and Windows.
 """
 
+import contextlib
 import errno
 import ipaddress
+import os
 import re
+import select
 import socket
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -151,9 +156,8 @@ def _serial_address(text: str, url: str) -> SerialAddress:
     return SerialAddress(match[1], int(match[2] or DEFAULT_BAUD), url)
 
 
-READ_BYTES = 4096
-"""A stream port reads at most so many bytes at once."""
-
+# A stream port reads at most so many bytes at once.
+_READ_BYTES = 4096
 # A stream that accepts no data for this time is broken.
 _STALLED_S = 5.0
 _SEND_BUFFER = 16_384
@@ -211,8 +215,6 @@ def open_port(address: Address) -> Port:
     Raises `OSError` if it cannot be opened now; later it may.
     """
     if isinstance(address, SerialAddress):
-        from aqualvs.live.mavlink.serial import SerialPort
-
         return SerialPort(address)
     if address.kind == "tcp":
         return _TcpPort(address)
@@ -223,10 +225,21 @@ def open_port(address: Address) -> Port:
 
 def check_address(address: Address) -> None:
     """Raise `OptionError` for a serial port without pyserial, or of a speed unknown to it."""
-    if isinstance(address, SerialAddress):
-        from aqualvs.live.mavlink.serial import check_speed
-
-        check_speed(address)
+    if not isinstance(address, SerialAddress):
+        return
+    try:
+        from serial import Serial
+    except ImportError as fault:
+        raise OptionError(
+            f"MAVLink connection {address.device}: serial ports need pyserial: "
+            "pip install 'aqualvs[mavlink]'"
+        ) from fault
+    if address.baud not in Serial.BAUDRATES:
+        known = ", ".join(str(baud) for baud in Serial.BAUDRATES if baud >= 9600)
+        raise OptionError(
+            f"MAVLink connection {address.device}: speed {address.baud} baud is unknown here; "
+            f"use one of {known}"
+        )
 
 
 def find_host(host: str, port: int, flags: int) -> tuple[int, tuple[object, ...]]:
@@ -427,10 +440,93 @@ class _TcpPort(StreamPort):
         self._socket.close()
 
     def _take(self) -> bytes:
-        return self._socket.recv(READ_BYTES)
+        return self._socket.recv(_READ_BYTES)
 
     def _give(self, data: bytes) -> int:
         return self._socket.send(data)
+
+
+class SerialPort(StreamPort):
+    """A serial port with eight bits, no parity, one stop bit and no flow control.
+
+    A thread reads, because Windows cannot wait for serial ports and sockets together.
+
+    Raises `OSError` if it is not there, not a serial port, or not ours to open.
+    """
+
+    def __init__(self, address: SerialAddress) -> None:
+        # How long the reader waits for a byte before it looks whether the port was closed.
+        read_s = 0.1
+        bits_per_byte = 10
+        super().__init__()
+        # Only those who have a serial line need it.
+        from serial import Serial
+
+        self._bytes_per_s = address.baud / bits_per_byte
+        # On Windows, a write that the driver does not take at once is given up after this time.
+        write_s = 0.0 if os.name == "posix" else 0.1
+        try:
+            self._serial = Serial(
+                address.device, address.baud, timeout=read_s, write_timeout=write_s
+            )
+        except Exception as fault:
+            raise _as_os_error(fault) from fault
+        self._received, self._incoming = socket.socketpair()
+        self._received.setblocking(False)
+        self._closing = False
+        self._reader = threading.Thread(
+            target=self._pour, name=f"serial {address.device}", daemon=True
+        )
+        self._reader.start()
+
+    @property
+    def lag_s(self) -> float:
+        """How long the driver is going to send what it holds already."""
+        return float(self._serial.out_waiting) / self._bytes_per_s
+
+    def fileno(self) -> int:
+        """Return the number to wait on."""
+        return self._received.fileno()
+
+    def close(self) -> None:
+        """Free the port at once; what waits is lost."""
+        if self._closing:
+            return
+        self._closing = True
+        # The reader may wait for room.
+        self._received.close()
+        with contextlib.suppress(OSError):
+            self._serial.cancel_read()
+        self._reader.join()
+        # Without this, closing waits until the driver has sent what it holds. Of a device that has
+        # gone, pyserial also passes on errors of the system that are no OSError.
+        with contextlib.suppress(Exception):
+            self._serial.reset_output_buffer()
+        self._serial.close()
+
+    def _pour(self) -> None:
+        """Pass on what comes until the port is closed or gone."""
+        with self._incoming, contextlib.suppress(OSError):
+            while not self._closing:
+                size = min(_READ_BYTES, max(1, self._serial.in_waiting))
+                self._incoming.sendall(self._serial.read(size))
+
+    def _take(self) -> bytes:
+        return self._received.recv(_READ_BYTES)
+
+    def _give(self, data: bytes) -> int:
+        # pyserial tries again and again while there is no room.
+        if os.name == "posix" and not select.select((), (self._serial,), (), 0)[1]:
+            raise BlockingIOError
+        return self._serial.write(data) or 0
+
+
+def _as_os_error(fault: Exception) -> OSError:
+    """Return why a port cannot be opened; pyserial's own text names the device three times."""
+    number = fault.args[0] if fault.args and isinstance(fault.args[0], int) else None
+    if number is None:
+        return OSError(0, "this is not a serial port")
+    return OSError(number, os.strerror(number))
 
 
 def why(fault: Exception) -> str:
