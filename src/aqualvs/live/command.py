@@ -205,9 +205,16 @@ def make_runner(
 ) -> LiveRunner:
     """Make the live loop; if a part fails, the parts made before it are closed.
 
-    `provider`: makes the provider of the scanner, after everything else. `holder`, `vehicle`: as
-    `Page.serve` takes them; the vehicle is by default that of the first output that an autopilot
-    answers. `first`: outputs before all others; taken once the source is open.
+    Parameters
+    ----------
+    provider : callable
+        Makes the provider of the scanner, after everything else.
+    holder : SetpointHolder
+        Where the page puts what is to be held.
+    first : iterable of Output
+        Outputs before all others; taken once the source is open.
+    vehicle : callable, optional
+        As `Page.serve` takes it; by default of the first output that an autopilot answers.
     """
     sys.setswitchinterval(SWITCH_S)
     options = RecorderOptions(

@@ -5,6 +5,7 @@ capture cards repeat their last picture when the camera fails, and the stream lo
 `DriftWatch` detects a laser that has moved, in a thread of its own, because its test takes long.
 """
 
+import contextlib
 import itertools
 import math
 import queue
@@ -122,8 +123,11 @@ class FrozenPicture:
         """
         cells, reduced = _cell_means(luma), _reduced(luma)
         height, width = luma.shape
-        if self._kept and not self._continues(time_s, (height, width)):
-            self._restart()
+        gap_s = 2.0  # A stream that returns after this time counts as a new one, in seconds.
+        if self._kept:
+            last = self._kept[-1]
+            if last.shape != luma.shape or not last.time_s <= time_s <= last.time_s + gap_s:
+                self._restart()
         while len(self._kept) > 1 and time_s - self._kept[1].time_s >= self._span_s:
             self._kept.popleft()
         self._compare(time_s, cells, reduced)
@@ -143,11 +147,6 @@ class FrozenPicture:
     def _assume_live(self) -> None:
         """Take the picture for a live one."""
         self._since_s = self._moved_s = self._doubted_s = self._pace = self._moving_s = math.nan
-
-    def _continues(self, time_s: float, shape: tuple[int, int]) -> bool:
-        gap_s = 2.0  # A stream that returns after this time counts as a new one, in seconds.
-        last = self._kept[-1]
-        return last.time_s <= time_s <= last.time_s + gap_s and last.shape == shape
 
     def _compare(self, time_s: float, cells: FloatArray, reduced: NDArray[np.float32]) -> None:
         """Compare with the oldest picture kept, if it is old enough."""
@@ -296,7 +295,11 @@ class DriftWatch:
         self.off: dict[int, str] = {}
         self._scans: queue.Queue[Scan | None] = queue.Queue(8)
         self._thread: threading.Thread | None = None
-        agreement = _agreement_of(rig)
+        agreement = None
+        if rig.housing is not None and len(rig.lasers) > 1:
+            # A rig's uncertainty that cannot be parsed is not needed to measure.
+            with contextlib.suppress(RigError):
+                agreement = LaserAgreement(rig)
         if agreement is not None:
             self._thread = threading.Thread(
                 target=self._watch, args=(agreement,), name="drift", daemon=True
@@ -325,16 +328,6 @@ class DriftWatch:
             if time.monotonic() - judged_s > _VERDICT_EVERY_S:
                 self.off = suspects_of(agreement)
                 judged_s = time.monotonic()
-
-
-def _agreement_of(rig: Rig) -> LaserAgreement | None:
-    if rig.housing is None or len(rig.lasers) < 2:
-        return None
-    try:
-        return LaserAgreement(rig)
-    except RigError:
-        # The rig's uncertainty cannot be parsed; measuring does not need it.
-        return None
 
 
 def suspects_of(agreement: LaserAgreement) -> dict[int, str]:

@@ -232,8 +232,13 @@ class Pilot(Output):
                 return
             sent = replace(decision, effort=self._execute(decision))
             at_ns, frame = round(1e9 * now_s), sample.scan.index
-            self._latest = PilotReport(at_ns=at_ns, frame=frame, decision=sent, state=state)
-        self._log_changes(self._latest)
+            report = PilotReport(at_ns=at_ns, frame=frame, decision=sent, state=state)
+            self._latest = report
+        told = (report.decision.engaged, report.decision.reason, report.state.doubt)
+        if told != self._logged:
+            self._logged = told
+            level = logging.INFO if report.health_state is State.OK else logging.WARNING
+            _log.log(level, "pilot, frame %d: %s", report.frame, report.words)
 
     def health(self) -> PartHealth:
         """Return the pilot's action, or the reason for none."""
@@ -317,12 +322,3 @@ class Pilot(Output):
             stopped = Decision(NEUTRAL, LimitReason.NOT_ENGAGED, guidance, engaged=False)
             self._latest = replace(self._latest, decision=stopped)
         self._send_neutral(_NEUTRALS)
-
-    def _log_changes(self, report: PilotReport) -> None:
-        """Log changes."""
-        state = (report.decision.engaged, report.decision.reason, report.state.doubt)
-        if state == self._logged:
-            return
-        self._logged = state
-        level = logging.INFO if report.health_state is State.OK else logging.WARNING
-        _log.log(level, "pilot, frame %d: %s", report.frame, report.words)

@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -164,13 +164,13 @@ class OutputWorker:
             _log.exception("%s: closing failed", self.name)
 
     def _run(self) -> None:
-        while (sample := self._next_sample()) is not None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._closing)
+                if not self._waiting:
+                    return
+                sample = self._waiting.popleft()
             self._send(sample)
-
-    def _next_sample(self) -> LiveSample | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._closing)
-            return self._waiting.popleft() if self._waiting else None
 
     def _send(self, sample: LiveSample) -> None:
         try:
@@ -184,8 +184,7 @@ class OutputWorker:
             self._fault = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
+class Arrival(NamedTuple):
     """A frame and when it came."""
 
     frame: Frame
@@ -340,8 +339,20 @@ class LiveOptions:
 class LiveRunner:
     """Live loop: measures a feed as it comes and passes the results to the outputs.
 
-    `provider` and `outputs` are closed at the end. `posture_filter`: smooths over time, in addition
-    to the raw values. `n_measured`, `n_postures`: frames measured until now; those with a posture.
+    Parameters
+    ----------
+    feed : Feed
+    provider : ScannerProvider
+        Closed at the end.
+    outputs : sequence of Output
+        Closed at the end.
+    posture_filter : PostureFilter or None
+        Smooths over time, in addition to the raw values.
+
+    Attributes
+    ----------
+    n_measured, n_postures : int
+        Frames measured until now; those with a posture.
 
     The first output that an autopilot answers tells how the vehicle turns, for a rolling shutter.
     """

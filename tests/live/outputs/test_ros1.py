@@ -420,11 +420,6 @@ def test_without_rosbags(monkeypatch: pytest.MonkeyPatch) -> None:
         Ros1Output()
 
 
-def test_wrong_node_name() -> None:
-    with pytest.raises(OptionError, match="ROS node '/aqualvs'"):
-        Ros1Output(node_name="/aqualvs")
-
-
 def test_advertised_host() -> None:
     assert advertised_host("localhost", {"ROS_HOSTNAME": "rov.local"}) == "rov.local"
     assert advertised_host("localhost", {"ROS_IP": "192.168.2.2"}) == "192.168.2.2"

@@ -206,7 +206,14 @@ class FoxgloveOutput(Output):
         # Channels do not keep it alive.
         self._context = context = foxglove.Context()
         shown = [POSTURE, POINTS, PICTURE, HEALTH, RIG]
-        self._channels = {topic: _channel(foxglove, topic, context) for topic in shown}
+        self._channels: dict[RecordedTopic, Channel] = {}
+        for topic in shown:
+            schema = foxglove.Schema(
+                name=topic.kind, encoding="ros2msg", data=topic.definition.encode("utf-8")
+            )
+            self._channels[topic] = foxglove.Channel(
+                topic.name, schema=schema, message_encoding="cdr", context=context
+            )
         self._transforms = foxglove.channels.FrameTransformsChannel(_TRANSFORMS, context=context)
         self._scene = foxglove.channels.SceneUpdateChannel(_SCENE, context=context)
         self._picture_due, self._points_due = RateLimit(picture_hz), RateLimit(points_hz)
@@ -327,13 +334,3 @@ def _sdk() -> Any:
             "foxglove: needs foxglove-sdk; install it by pip install 'aqualvs[foxglove]'"
         ) from None
     return foxglove
-
-
-def _channel(foxglove: Any, topic: RecordedTopic, context: Any) -> "Channel":
-    schema = foxglove.Schema(
-        name=topic.kind, encoding="ros2msg", data=topic.definition.encode("utf-8")
-    )
-    found: Channel = foxglove.Channel(
-        topic.name, schema=schema, message_encoding="cdr", context=context
-    )
-    return found

@@ -10,7 +10,6 @@ import functools
 import http.client
 import logging
 import os
-import re
 import socket
 import socketserver
 import threading
@@ -48,9 +47,21 @@ _log = logging.getLogger(__name__)
 class Ros1Node:
     """ROS 1 node that publishes topics; registers with roscore whenever that is there.
 
-    `name`: the full one, such as `/aqualvs`. `topics`: type of each topic by its full name.
-    `master_uri`: where roscore is. `environment`: with `ROS_HOSTNAME` or `ROS_IP`, the name that
-    subscribers reach this machine by. Raises `OptionError` if `master_uri` is no address.
+    Parameters
+    ----------
+    name : str
+        Full name, such as `/aqualvs`.
+    topics : mapping
+        Type of each topic by its full name.
+    master_uri : str
+        Where roscore is.
+    environment : mapping
+        `ROS_HOSTNAME` or `ROS_IP`: the name that subscribers reach this machine by.
+
+    Raises
+    ------
+    OptionError
+        If `master_uri` is no address.
     """
 
     def __init__(
@@ -61,20 +72,15 @@ class Ros1Node:
         environment: Mapping[str, str],
     ) -> None:
         self.name, self.topics, self.master_uri = name, dict(topics), master_uri
-        self._host = advertised_host(master_host(master_uri), environment)
+        self.host = advertised_host(master_host(master_uri), environment)
         self._stop = threading.Event()
         self._fault, self._ended = "not registered yet", ""
-        at = "127.0.0.1" if _is_loopback(self._host) else "0.0.0.0"
+        at = "127.0.0.1" if _is_loopback(self.host) else "0.0.0.0"
         self.links = Ros1Links(at, name, topics)
         self._server = _Server(at, self)
-        self.uri = f"http://{self._host}:{self._server.server_address[1]}/"
+        self.uri = f"http://{self.host}:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._stay_registered, name="ros1 node", daemon=True)
         self._thread.start()
-
-    @property
-    def tcpros(self) -> list[Any]:
-        """Address for subscribers, in the protocol's form."""
-        return ["TCPROS", self._host, self.links.port]
 
     @property
     def fault(self) -> str:
@@ -103,8 +109,7 @@ class Ros1Node:
         while not self._stop.wait(wait_s):
             try:
                 with _master(self.master_uri) as master:
-                    if not (registered and self._is_known(master)):
-                        self._register(master)
+                    self._register(master, is_known=registered)
             except _MASTER_ERRORS as fault:
                 registered = False
                 self._fault = f"no roscore at {self.master_uri} ({fault})"
@@ -115,11 +120,11 @@ class Ros1Node:
         if registered:
             self._unregister()
 
-    def _is_known(self, master: xmlrpc.client.ServerProxy) -> bool:
-        code, _, uri = _answer(master.lookupNode(self.name, self.name))
-        return code == 1 and uri == self.uri
-
-    def _register(self, master: xmlrpc.client.ServerProxy) -> None:
+    def _register(self, master: xmlrpc.client.ServerProxy, *, is_known: bool) -> None:
+        if is_known:
+            code, _, uri = _answer(master.lookupNode(self.name, self.name))
+            if code == 1 and uri == self.uri:
+                return
         for topic, kind in self.topics.items():
             code, text, _ = _answer(master.registerPublisher(self.name, topic, kind.name, self.uri))
             if code != 1:
@@ -187,7 +192,7 @@ class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
             return [-1, f"{topic} is not published by {self._node.name}", []]
         if not any(protocol and protocol[0] == "TCPROS" for protocol in protocols):
             return [0, "TCPROS only", []]
-        return [1, "ready", self._node.tcpros]
+        return [1, "ready", ["TCPROS", self._node.host, self._node.links.port]]
 
     def handle_error(self, *_: object) -> None:
         """Take note of a caller that went away or talked nonsense, and no more."""
@@ -266,40 +271,26 @@ def _is_loopback(host: str) -> bool:
     return host == "localhost" or host.startswith("127.")
 
 
-_NODE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-
-
 class Ros1Output(Output):
     """Publisher of ROS 1 topics, whether ROS is installed on this machine or not.
 
-    `master_uri`: where roscore is; None for `ROS_MASTER_URI`, this machine where that is not set.
-    `node_name`: a node of the same name is ended by ROS. `environment`: for `ROS_MASTER_URI`,
-    `ROS_HOSTNAME` and `ROS_IP`. Raises `OptionError` if the address of roscore or the node's name
-    is none, or rosbags is not installed.
+    Its node is `/aqualvs`; another of that name is ended by ROS. `environment`: for
+    `ROS_MASTER_URI` (this machine where that is not set), `ROS_HOSTNAME` and `ROS_IP`. Raises
+    `OptionError` if the address of roscore is none, or rosbags is not installed.
     """
 
     name = "ros1"
 
-    def __init__(
-        self,
-        options: RosOptions | None = None,
-        *,
-        master_uri: str | None = None,
-        node_name: str = "aqualvs",
-        environment: Mapping[str, str] = os.environ,
-    ) -> None:
-        if not _NODE_NAME.fullmatch(node_name):
-            raise OptionError(f"ROS node {node_name!r}: use letters, digits and _")
-        options = options or RosOptions()
-        master = master_uri or environment.get("ROS_MASTER_URI") or DEFAULT_MASTER
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        master = environment.get("ROS_MASTER_URI") or DEFAULT_MASTER
         self._names = {topic: topic.full_name for topic in PublishedTopic}
         self._topics = {name: topic for topic, name in self._names.items()}
         self._store = ros1_store()
-        self._maker = MessageMaker(options, ros1_types(self._store))
+        self._maker = MessageMaker(RosOptions(), ros1_types(self._store))
         self._n_sent: Counter[PublishedTopic] = Counter()
         self._closed = False
         types = {name: ros1_type(self._store, topic) for topic, name in self._names.items()}
-        self._node = Ros1Node(f"/{node_name}", types, master, environment)
+        self._node = Ros1Node("/aqualvs", types, master, environment)
 
     @property
     def uri(self) -> str:

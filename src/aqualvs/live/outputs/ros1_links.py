@@ -14,11 +14,10 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Ros1Type:
+class Ros1Type(NamedTuple):
     """A message type as publishers and subscribers agree on it."""
 
     name: str

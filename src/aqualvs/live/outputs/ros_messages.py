@@ -227,14 +227,14 @@ class MessageMaker:
 
         Without a posture there is no pose, and the range is not a number.
         """
-        posture, filtered = sample.scan.posture, sample.filtered
-        if PublishedTopic.POSTURE in wanted and posture:
-            pose = plane_pose(posture.range, posture.pitch, posture.yaw, posture.total_covariance)
-            yield PublishedTopic.POSTURE, self._pose(sample, pose)
-        if PublishedTopic.FILTERED in wanted and filtered is not None:
-            cov = filtered.total_covariance
-            pose = plane_pose(filtered.range, filtered.pitch, filtered.yaw, cov)
-            yield PublishedTopic.FILTERED, self._pose(sample, pose)
+        postures = {
+            PublishedTopic.POSTURE: sample.scan.posture,
+            PublishedTopic.FILTERED: sample.filtered,
+        }
+        for topic, found in postures.items():
+            if topic in wanted and found:
+                pose = plane_pose(found.range, found.pitch, found.yaw, found.total_covariance)
+                yield topic, self._pose(sample, pose)
         if PublishedTopic.RANGE in wanted:
             yield PublishedTopic.RANGE, self._range(sample)
         if PublishedTopic.CLOUD in wanted:
