@@ -14,7 +14,7 @@ from aqualvs.sources import ImageSource, open_feed, open_source
 from aqualvs.sources.base import State
 from aqualvs.sources.datagrams import UdpAddress, parse_udp
 from aqualvs.sources.opening import PacedFeed
-from aqualvs.sources.remote import CameraFeed, CameraOptions, RemoteFeed, camera_device
+from aqualvs.sources.remote import CameraFeed, RemoteFeed, camera_device, camera_options
 from aqualvs.sources.udp import UdpFeed, read_sdp
 from aqualvs.sources.video import FrameCounter
 from shell_cases import cut_after, picture, write_video
@@ -161,13 +161,12 @@ def test_names_of_cameras(where, device):
 
 
 def test_what_is_asked_of_a_camera():
-    options = CameraOptions(size_px=(1920, 1080), fps=29.97, pixel_format="h264")
-    assert options.for_ffmpeg() == {
+    assert camera_options((1920, 1080), 29.97, "h264") == {
         "video_size": "1920x1080",
         "framerate": "29.97",
         "input_format": "h264",
     }
-    assert CameraOptions().for_ffmpeg() == {}
+    assert camera_options(None, None, None) == {}
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Video4Linux")
@@ -184,7 +183,7 @@ def test_a_device_that_is_no_camera_is_tried_again(tmp_path):
     """A file stands for a camera that another program holds: it exists and cannot be opened."""
     path = tmp_path / "video0"
     path.write_bytes(b"")
-    feed = CameraFeed(f"camera:{path}", CameraOptions())
+    feed = CameraFeed(f"camera:{path}", {})
     thread = threading.Thread(target=lambda: list(feed), daemon=True)
     thread.start()
     until(lambda: "no connection" in feed.health().detail)

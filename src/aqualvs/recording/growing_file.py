@@ -152,7 +152,7 @@ class GrowingFile:
         self._frontier = self._limit = self._summary_at = self._tail = self._size = 0
         self._summary_placed = True
         draft = path.with_name(path.name + ".part")
-        self._file = (open_file or _open)(draft)
+        self._file = draft.open("w+b", buffering=0) if open_file is None else open_file(draft)
         try:
             self._begin(mcap_file.MAGIC + header + self._repeated)
             _publish(draft, path)
@@ -264,7 +264,8 @@ class GrowingFile:
         """Return a file size with space for more data and their summary."""
         summary_bytes = self._summary_bytes()
         data_bytes = max(_DATA_BYTES, _DATA_PER_SUMMARY * summary_bytes) + n_data
-        return _page_up(size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES)
+        end = size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES
+        return _page_down(end + PAGE - 1)
 
     def _place_summary(self) -> None:
         """Move the summary near the end of the file and free the space before it."""
@@ -317,16 +318,8 @@ class GrowingFile:
             rest = rest[self._file.write(rest) :]
 
 
-def _page_up(n: int) -> int:
-    return -(-n // PAGE) * PAGE
-
-
 def _page_down(n: int) -> int:
     return n // PAGE * PAGE
-
-
-def _open(path: Path) -> BinaryIO:
-    return path.open("w+b", buffering=0)
 
 
 def _publish(draft: Path, path: Path) -> None:

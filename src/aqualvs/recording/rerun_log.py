@@ -34,7 +34,7 @@ from aqualvs.recording.messages import RateLimit
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Label
-from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, reason_text
+from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, bgr, reason_text
 
 RRD = ".rrd"
 """Suffix of Rerun's files."""
@@ -137,9 +137,7 @@ class RerunLog(Closing):
     def _log_styles(self) -> None:
         rr = self._rr
         labels = [
-            rr.AnnotationInfo(
-                int(one), LABEL_WORDS[one], tuple(bytes.fromhex(LABEL_COLOURS[one].lstrip("#")))
-            )
+            rr.AnnotationInfo(int(one), LABEL_WORDS[one], bgr(LABEL_COLOURS[one])[::-1])
             for one in Label
         ]
         self._log_static(_TARGET, rr.ViewCoordinates.RIGHT_HAND_Z_UP)

@@ -91,22 +91,19 @@ def bgr_of(frame: Frame) -> ImagePlane:
     A field has each of its rows twice, so that pixels of the picture lie where they do in the
     picture.
     """
-    image = _bgr_of(frame)
-    return image if frame.field is None else np.repeat(image, 2, axis=0)
-
-
-def _bgr_of(frame: Frame) -> ImagePlane:
     if frame.chroma is None:
-        return cast(ImagePlane, cv2.cvtColor(frame.luma, cv2.COLOR_GRAY2BGR))
-    height, width = frame.luma.shape
-    rows, columns = frame.chroma[0].shape
-    i420 = np.empty((3 * rows, 2 * columns), np.uint8)
-    # With an odd height or width, the even picture has a row or column too many.
-    i420[: 2 * rows] = 0
-    i420[:height, :width] = frame.luma
-    i420[2 * rows :] = np.stack(frame.chroma).reshape(rows, 2 * columns)
-    image = cv2.cvtColor(i420, cv2.COLOR_YUV2BGR_I420)
-    return np.ascontiguousarray(image[:height, :width], dtype=np.uint8)
+        image = cast(ImagePlane, cv2.cvtColor(frame.luma, cv2.COLOR_GRAY2BGR))
+    else:
+        height, width = frame.luma.shape
+        rows, columns = frame.chroma[0].shape
+        i420 = np.empty((3 * rows, 2 * columns), np.uint8)
+        # With an odd height or width, the even picture has a row or column too many.
+        i420[: 2 * rows] = 0
+        i420[:height, :width] = frame.luma
+        i420[2 * rows :] = np.stack(frame.chroma).reshape(rows, 2 * columns)
+        whole = cv2.cvtColor(i420, cv2.COLOR_YUV2BGR_I420)
+        image = np.ascontiguousarray(whole[:height, :width], dtype=np.uint8)
+    return image if frame.field is None else np.repeat(image, 2, axis=0)
 
 
 def planes_of(picture: VideoFrame) -> Planes:

@@ -8,13 +8,11 @@ without another source are those of ITU-T H.264.
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 
-@dataclass(frozen=True, slots=True)
-class Units:
+class Units(NamedTuple):
     """Units of a packet up to its first coded slice."""
 
     is_refresh: bool  # Whether the picture is an IDR picture: decoding may begin with it.
@@ -27,8 +25,7 @@ UnitReader: TypeAlias = Callable[[memoryview], Units]
 """Reader of the units of a packet."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Codec:
+class _Codec(NamedTuple):
     """Codec's unit types by their number (ITU-T H.264, table 7-1; H.265, table 7-1)."""
 
     shift: int
@@ -139,19 +136,15 @@ class FrameNumbers:
                 form = _slice_form(unit)
                 self._form = None if form is None or form.may_skip_numbers else form
             elif kind in (NalType.SLICE, NalType.IDR):
-                return self._check(unit, is_idr=kind == NalType.IDR)
+                if self._form is None:
+                    return False
+                number = self._form.number(_Bits(unit[1:]))
+                last, self._last = self._last, (number, bool(unit[0] & 0x60))
+                # The same number: after a picture that is no reference, or the other field of one.
+                if last is None or kind == NalType.IDR or number == last[0]:
+                    return False
+                return not last[1] or number != (last[0] + 1) % (1 << self._form.number_bits)
         return False
-
-    def _check(self, unit: bytes, *, is_idr: bool) -> bool:
-        if self._form is None:
-            return False
-        number = self._form.number(_Bits(unit[1:]))
-        last, self._last = self._last, (number, bool(unit[0] & 0x60))
-        if last is None or is_idr:
-            return False
-        if number == last[0]:  # After a picture that is no reference, or the other field of one.
-            return False
-        return not last[1] or number != (last[0] + 1) % (1 << self._form.number_bits)
 
 
 class FieldPairs:
@@ -219,8 +212,7 @@ class _Bits:
         return (1 << zeros) - 1 + self.read(zeros)
 
 
-@dataclass(frozen=True, slots=True)
-class _SliceForm:
+class _SliceForm(NamedTuple):
     """What a sequence parameter set says of the heads of slices (7.3.2.1.1, 7.3.3)."""
 
     number_bits: int  # Width of `frame_num`.

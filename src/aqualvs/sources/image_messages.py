@@ -9,7 +9,7 @@ import base64
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import av
 import cv2
@@ -292,8 +292,7 @@ Logged: TypeAlias = tuple[int, ImageMessage | None]
 """Time of the log in nanoseconds, and the image; None for a message that cannot be read."""
 
 
-@dataclass(frozen=True, slots=True)
-class ImageTopic:
+class ImageTopic(NamedTuple):
     """A topic with images."""
 
     name: str
@@ -325,10 +324,23 @@ def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> Im
 class MessageSource(Closing):
     """Source of the images of one topic; satisfies `FrameSource`.
 
-    `messages`: begins to read, from the first message on; ends early where the recording is cut
-    short, by raising `SourceError`. `n_frames`: messages that the recording promises. Raises
-    `SourceError` if no picture can be decoded at the start, or its encoding is unknown.
+    Parameters
+    ----------
+    name : str
+        Path and topic.
+    messages : callable
+        Begins to read, from the first message on; ends early where the recording is cut short,
+        by raising `SourceError`.
+    n_frames : int or None
+        Messages that the recording promises.
 
+    Raises
+    ------
+    SourceError
+        If no picture can be decoded at the start, or its encoding is unknown.
+
+    Notes
+    -----
     Times are those of the pictures where the messages have them, else those of the log. Pictures of
     a video that are predicted from a lost one are not delivered (see `LiveDecoder`).
     """

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import pyarrow as pa
 
@@ -117,9 +117,18 @@ def chunk_index(
 ) -> bytes:
     """Return where a chunk is.
 
-    `times_ns`: of its first and last message. `at`, `length`: of its record in the file.
-    `index_offsets`: where each channel's message index is in the file. `index_length`: of all these
-    together. `sizes`: compressed and raw.
+    Parameters
+    ----------
+    times_ns : (int, int)
+        Of its first and last message.
+    at, length : int
+        Of the chunk's record in the file.
+    index_offsets : mapping
+        Where each channel's message index is in the file.
+    index_length : int
+        Of all these indexes together.
+    sizes : (int, int)
+        Compressed and raw.
     """
     offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
     return record(
@@ -173,8 +182,7 @@ _MAX_SUMMARY_BYTES = 1 << 24
 _KNOWN = frozenset(Op)
 
 
-@dataclass(frozen=True, slots=True)
-class StoredMessage:
+class StoredMessage(NamedTuple):
     """One message."""
 
     topic: str

@@ -189,7 +189,7 @@ def open_feed(
     OptionError
         If an option does not go with the source.
     """
-    from aqualvs.sources.remote import CameraFeed, CameraOptions, is_camera
+    from aqualvs.sources.remote import CameraFeed, camera_options, is_camera
 
     text = str(where)
     if fps is not None and not 0 < fps < math.inf:
@@ -198,7 +198,7 @@ def open_feed(
         _refuse(not realtime, text, "only a recording can be read faster; leave --fast out")
     if is_camera(text):
         _refuse(transport, text, "a camera has no transport; leave it out")
-        return CameraFeed(text, CameraOptions(size_px=size_px, fps=fps, pixel_format=pixel_format))
+        return CameraFeed(text, camera_options(size_px, fps, pixel_format))
     _refuse(size_px or pixel_format, text, "only a camera takes a size or format; leave it out")
     if not text.lower().startswith("rtsp"):
         _refuse(transport, text, "only RTSP has a choice of transport; leave it out")

@@ -7,7 +7,6 @@ import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -170,35 +169,30 @@ def remote_feed(address: str, *, transport: Transport = "tcp") -> RemoteFeed:
 _DEVICES = Path("/dev")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraOptions:
-    """Options requested of a camera; the camera chooses those left out."""
+def camera_options(
+    size_px: tuple[int, int] | None, fps: float | None, pixel_format: str | None
+) -> dict[str, str]:
+    """Return the options of FFmpeg's `v4l2` input; the camera chooses those that are None.
 
-    size_px: tuple[int, int] | None = None  # Width and height.
-    fps: float | None = None  # Frames per second.
-    # As FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full rate with the
-    # first two only.
-    pixel_format: str | None = None
-
-    def for_ffmpeg(self) -> dict[str, str]:
-        """Return the options of FFmpeg's `v4l2` input."""
-        found = {
-            "video_size": None if self.size_px is None else "x".join(map(str, self.size_px)),
-            "framerate": None if self.fps is None else f"{self.fps:g}",
-            "input_format": self.pixel_format,
-        }
-        return {name: text for name, text in found.items() if text is not None}
+    `pixel_format`: as FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full
+    rate with the first two only.
+    """
+    found = {
+        "video_size": None if size_px is None else "x".join(map(str, size_px)),
+        "framerate": None if fps is None else f"{fps:g}",
+        "input_format": pixel_format,
+    }
+    return {name: text for name, text in found.items() if text is not None}
 
 
 class CameraFeed(RemoteFeed):
     """Feed of a camera; reopened when it is unplugged and returns.
 
-    `where`: `/dev/video0`, `camera:0`, or `camera:` and a path.
+    `where`: `/dev/video0`, `camera:0`, or `camera:` and a path. `asked`: from `camera_options`.
     """
 
-    def __init__(self, where: str, options: CameraOptions) -> None:
+    def __init__(self, where: str, asked: dict[str, str]) -> None:
         self._device = camera_device(where)
-        asked = options.for_ffmpeg()
 
         def opener() -> InputContainer:
             return av.open(

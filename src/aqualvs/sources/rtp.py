@@ -3,7 +3,6 @@
 Of RFC 6184, single NAL units, STAP-A and FU-A are read.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from aqualvs.sources.h264 import START_CODE, NalType
@@ -16,8 +15,7 @@ _RESTART_SILENCE_S = 0.1
 """Time for which the sender in use must be silent before another takes its place."""
 
 
-@dataclass(frozen=True, slots=True)
-class RtpPacket:
+class RtpPacket(NamedTuple):
     """One packet."""
 
     payload_type: int
@@ -158,8 +156,7 @@ _UNUSED = frozenset({0, 2, 3, 4, 30, 31})
 """Types that no H.264 encoder sends, but that H.265 in RTP often contains."""
 
 
-@dataclass(frozen=True, slots=True)
-class AccessUnit:
+class AccessUnit(NamedTuple):
     """One coded picture."""
 
     ticks: int  # Time, 90 kHz, continued past 32 bits.

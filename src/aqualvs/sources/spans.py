@@ -190,8 +190,11 @@ class _PacketIndex:
     def spans(self, n_min: int, margin: int) -> tuple[Span, ...]:
         """Return the spans, each of which begins at a picture that needs none before it."""
         cuts, n = self._usable_cuts(), len(self._pts)
-        origin, found = min(self._pts), []
-        for first, stop in itertools.pairwise([*_spaced(cuts, n_min), n]):
+        origin, found, chosen = min(self._pts), [], cuts[:1]
+        for cut in cuts:
+            if cut - chosen[-1] >= n_min:
+                chosen.append(cut)
+        for first, stop in itertools.pairwise([*chosen, n]):
             begin = max(cut for cut in cuts if cut <= max(first - margin, 0))
             end = min(cut for cut in (*cuts, n) if cut >= min(stop + margin, n))
             found.append(
@@ -232,15 +235,6 @@ class _PacketIndex:
         # Parameter sets within the file apply from there on; a span must contain its own.
         self._sets_in_band = self._sets_in_band or found.has_parameter_sets
         return found.is_refresh and (found.has_all_parameter_sets or not self._sets_in_band)
-
-
-def _spaced(cuts: Sequence[int], n_min: int) -> list[int]:
-    """Return the first cut, and those at least `n_min` frames after the one chosen before."""
-    chosen = [cuts[0]]
-    for cut in cuts:
-        if cut - chosen[-1] >= n_min:
-            chosen.append(cut)
-    return chosen
 
 
 def _missing_end(stream: VideoStream, packets: _PacketIndex) -> str:

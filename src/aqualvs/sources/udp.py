@@ -11,10 +11,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import av
 from av.video.codeccontext import VideoCodecContext
@@ -48,8 +47,7 @@ from aqualvs.sources.rtp import (
 from aqualvs.special_files import refuse_special
 
 
-@dataclass(frozen=True, slots=True)
-class SdpVideo:
+class SdpVideo(NamedTuple):
     """The video that a session description announces."""
 
     address: UdpAddress  # Where it arrives; the host is kept for multicast only.
@@ -218,9 +216,17 @@ def decoder_of(codec: str, parameter_sets: bytes = b"") -> VideoCodecContext:
 class UdpFeed:
     """Feed from a UDP port, whatever kind of stream arrives; satisfies `Feed`.
 
-    `parameter_sets`: SPS and PPS as a byte stream, where an SDP file has them; else they come in
-    the stream. `payload_type`: of RTP; None takes every dynamic one (96 to 127).
+    Parameters
+    ----------
+    name : str
+        How health and messages call it.
+    parameter_sets : bytes
+        SPS and PPS as a byte stream, where an SDP file has them; else they come in the stream.
+    payload_type : int or None
+        Of RTP; None takes every dynamic one (96 to 127).
 
+    Notes
+    -----
     RTP and MPEG-TS are unpacked here and not by FFmpeg, whose interface hides which packets are
     lost, and which probes a stream before it shows a picture and holds one or two back. What a
     bare stream loses is found by the pictures' numbers only, and each of its pictures waits for

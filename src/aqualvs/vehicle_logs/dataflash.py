@@ -20,6 +20,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -86,8 +87,7 @@ class Format:
         return layout if layout.itemsize == self.length - 3 else None
 
 
-@dataclass(frozen=True, slots=True)
-class Records:
+class Records(NamedTuple):
     """Wanted records of a dataflash log."""
 
     # By kind, the columns; numbers as float64 in the units of the log's text form. Kinds without
@@ -319,13 +319,13 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
     ]
     pressure = candidates[-1].depth
     depth, stuck = choose_depth([*candidates, _barometer(tables, begin)], pressure)
-    found = {"depth": depth}
+    found: dict[str, tuple[Signal | None, str]] = {"depth": depth}
     for name, column, interpolation in (
         ("heading", "Yaw", Interpolation.BEARING),
         ("roll", "Roll", Interpolation.ANGLE),
         ("pitch", "Pitch", Interpolation.ANGLE),
     ):
-        found[name] = Candidate(_angle(tables, begin, column, interpolation), f"ATT.{column}")
+        found[name] = _angle(tables, begin, column, interpolation), f"ATT.{column}"
     utc, utc_from = _start_utc(tables, begin)
     # The vehicle's clock is set once, to about a second.
     utc_sigma_s = 1.0

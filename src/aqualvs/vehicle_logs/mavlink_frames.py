@@ -9,6 +9,7 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -98,8 +99,7 @@ class Table:
         return Table(self.at[mask], self.received_us[mask], self.source[mask], self.payload[mask])
 
 
-@dataclass(frozen=True, slots=True)
-class SelectedMessages:
+class SelectedMessages(NamedTuple):
     """Wanted messages of a telemetry log."""
 
     tables: Mapping[str, Table]  # By message name; messages without a frame are missing.

@@ -6,6 +6,7 @@ one offset, sample by sample.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,8 +25,7 @@ _TREND_S = 5.0
 net's own bearing along a cage, the drift of a compass."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rates:
+class Rates(NamedTuple):
     """Band-passed rates of one angle."""
 
     start_s: float  # Time of the first rate; the step is `STEP_S`.
@@ -138,8 +138,7 @@ def _autocorrelation(rates: Rates, reach: int) -> FloatArray:
     return mean / mean[0] if mean[0] > 0.0 else np.ones(reach)
 
 
-@dataclass(frozen=True, slots=True)
-class Channel:
+class Channel(NamedTuple):
     """Rates of one angle, measured relative to the net and logged by the vehicle."""
 
     name: str  # 'yaw' or 'pitch'.
@@ -199,8 +198,7 @@ def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
     return np.clip(rho, -1.0, 1.0), count
 
 
-@dataclass(frozen=True, slots=True)
-class Match:
+class Match(NamedTuple):
     """Seen and logged rates of a channel at one offset, sample by sample of the seen ones."""
 
     # Shape (n,): seen rate minus its prediction from the logged one; the seen rate itself where the

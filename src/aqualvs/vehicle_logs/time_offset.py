@@ -82,9 +82,21 @@ def find_time_offset(
 ) -> TimeOffset | OffsetRefusal:
     """Find the offset at which log and dive show the same motion.
 
-    It is refused if no offset is clearly the best: too little motion or overlap, or motion that
-    repeats itself. `start`: offset by the clocks; if motion alone is ambiguous, only offsets within
-    four of its sigmas are considered.
+    Parameters
+    ----------
+    log : VehicleLog
+        Log with heading, pitch or both.
+    posture_track : PostureTrack
+        Posture of the dive.
+    start : TimeOffset, optional
+        Offset by the clocks. If motion alone is ambiguous, only offsets within four of its sigmas
+        are considered.
+
+    Returns
+    -------
+    offset : TimeOffset or OffsetRefusal
+        A refusal if no offset is clearly the best: too little motion or overlap, or motion that
+        repeats itself.
 
     Notes
     -----
@@ -109,7 +121,13 @@ def find_time_offset(
     if isinstance(found, OffsetRefusal):
         return found
     refined = _refine(channels, found)
-    return refined if start is None else _compared(refined, start)
+    if start is None:
+        return refined
+    difference = start.offset_s - refined.offset_s
+    sigma = math.hypot(refined.sigma_s, start.sigma_s)
+    verdict = "agree" if abs(difference) <= _START_SIGMAS * sigma else "are not to be trusted"
+    how = f"{refined.how}; the clocks {verdict} ({difference:+.1f} s off)"
+    return replace(refined, how=how)
 
 
 def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | OffsetRefusal:
@@ -301,14 +319,6 @@ def _sigma(channels: tuple[Channel, ...], offset_s: float) -> float:
     derivative = float(earlier.sum() - later.sum()) / (2.0 * probe_s)
     slope = derivative if derivative > 0.0 else float(curvature.sum())
     return math.sqrt(float(sums @ sums)) / slope
-
-
-def _compared(found: TimeOffset, start: TimeOffset) -> TimeOffset:
-    """Return the offset with a comparison with that of the clocks in its description."""
-    difference = start.offset_s - found.offset_s
-    sigma = math.hypot(found.sigma_s, start.sigma_s)
-    verdict = "agree" if abs(difference) <= _START_SIGMAS * sigma else "are not to be trusted"
-    return replace(found, how=f"{found.how}; the clocks {verdict} ({difference:+.1f} s off)")
 
 
 VIDEO_UTC_SIGMA_S = 5.0

@@ -63,7 +63,11 @@ class Signal:
         later = np.ones(len(times), bool)
         later[1:] = times[1:] > np.maximum.accumulate(times)[:-1]
         times, found = times[later], found[later]
-        return cls(times, found, interpolation, usual_gap(times))
+        # Single lost messages are common: a gap is longer than so many usual steps, and than half a
+        # second, in which the motion of a vehicle under water hardly changes.
+        gap_steps, shortest_gap_s = 4.0, 0.5
+        usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        return cls(times, found, interpolation, max(gap_steps * usual_s, shortest_gap_s))
 
     def at(self, time_s: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return the values (m,) at other log times (m,), in any order, and where they are valid.
@@ -89,17 +93,6 @@ class Signal:
             values = bearing_of(values)
         values[~valid] = np.nan
         return values, valid
-
-
-def usual_gap(time_s: FloatArray) -> float:
-    """Return the longest step between increasing times that is not a gap, in seconds."""
-    steps = np.diff(time_s)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    # Single lost messages are common: a gap is longer than this many usual steps.
-    gap_steps = 4.0
-    # The motion of a vehicle under water hardly changes in half a second.
-    shortest_gap_s = 0.5
-    return max(gap_steps * usual, shortest_gap_s)
 
 
 def utc_seconds(text: str) -> float:
@@ -170,15 +163,10 @@ class VehicleLog:
     notes: tuple[str, ...] = ()
 
     @property
-    def signals(self) -> dict[str, Signal]:
-        """The continuous signals that the log has, by name."""
-        found = {name: getattr(self, name) for name in ("depth", "heading", "roll", "pitch")}
-        return {name: signal for name, signal in found.items() if signal is not None}
-
-    @property
     def span_s(self) -> tuple[float, float]:
         """First and last log time of any signal; both NaN for a log without signals."""
-        times = [signal.time_s for signal in self.signals.values()] or [np.array([np.nan])]
+        signals = (self.depth, self.heading, self.roll, self.pitch)
+        times = [one.time_s for one in signals if one is not None] or [np.array([np.nan])]
         return float(min(one[0] for one in times)), float(max(one[-1] for one in times))
 
     def at(self, time_s: ArrayLike) -> LoggedStates:
@@ -190,7 +178,7 @@ class VehicleLog:
         nothing = np.full(len(times), np.nan), np.zeros(len(times), bool)
         found: dict[str, Any] = {}
         for name in ("depth", "heading", "roll", "pitch"):
-            signal = self.signals.get(name)
+            signal = getattr(self, name)
             values, valid = nothing if signal is None else signal.at(times)
             found |= {name: values, f"{name}_valid": valid}
         return LoggedStates(time_s=times, **found)
