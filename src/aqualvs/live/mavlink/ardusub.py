@@ -240,7 +240,7 @@ class ArduSubOptions:
     turning_rate: float = math.radians(30.0)
 
     def __post_init__(self) -> None:
-        """Raise `OptionError` for what the types do not rule out; the others must be positive."""
+        """Raise `OptionError` for a mode that cannot be steered, or an impossible dead band."""
         allowed = _KEEPS_DEPTH[self.command]
         for mode in self.modes:
             if mode not in allowed:
@@ -262,8 +262,8 @@ class ArduSubOptions:
 class ArduSubLink:
     """A vehicle with ArduSub, as `aqualvs.control.vehicle.VehicleLink`.
 
-    `link`: is not closed here: others use it too. `advises`: whether settings of the vehicle that
-    are not safe are logged.
+    `link`: not closed here, since others use it too. `advises`: whether settings of the vehicle
+    that are not safe are logged.
     """
 
     def __init__(
