@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.missions import Guidance, Stage
+from aqualvs.control.missions import Guidance, Mission, Stage
 from aqualvs.control.vehicle import Setpoint, VehicleState
 from aqualvs.experiments.experiment import (
     DataColumns,
@@ -150,13 +150,10 @@ class _Setup(NamedTuple):
 _SETUP = _Setup()
 
 
-class _Descent:
+class _Descent(Mission):
     """Mission that sinks at a constant speed and holds range and yaw."""
 
     sways = False
-
-    def __init__(self, setpoint: Setpoint) -> None:
-        self._setpoint = setpoint
 
     def update(
         self,
@@ -167,10 +164,7 @@ class _Descent:
         """Return the setpoint and the descent; wait without a posture."""
         if posture is None:
             return Guidance(setpoint=None, stage=Stage.WAITING)
-        return Guidance(setpoint=self._setpoint, down=_SETUP.descent, stage=Stage.CHANGING_DEPTH)
-
-    def restart(self) -> None:
-        """Do nothing: no state is kept."""
+        return Guidance(setpoint=self.setpoint, down=_SETUP.descent, stage=Stage.CHANGING_DEPTH)
 
 
 @dataclass(slots=True)
