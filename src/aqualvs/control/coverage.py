@@ -45,10 +45,7 @@ class CoverageOptions:
     radius: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse sizes that are not positive.
-
-        Raises `OptionError` naming them.
-        """
+        """Raise `OptionError` naming the sizes if one is not positive."""
         sizes = (self.depth_cell, self.bearing_cell, self.along_cell)
         if not min(sizes) > 0.0:
             raise OptionError(f"coverage: cells of {sizes}; every size must be positive")
@@ -72,11 +69,6 @@ class CoverageMap:
     seconds: FloatArray
     # Shape (K, 3): time, place across and depth of the vehicle's foot on the net.
     path: FloatArray
-
-    @property
-    def seen_share(self) -> float:
-        """Share of the map's cells that were seen; 0 without any."""
-        return float(np.mean(self.seconds > 0.0)) if self.seconds.size else 0.0
 
 
 class Coverage:
