@@ -159,15 +159,7 @@ class AnswerWatch:
         self._effort = effort
 
     def see(self, now_s: float, posture: Posture, state: VehicleState) -> LimitReason | None:
-        """Add a new posture; return why it cannot be used, None if it can.
-
-        Parameters
-        ----------
-        posture : Posture
-            Of a frame that has not been seen before.
-        state : VehicleState
-            As the vehicle reports it.
-        """
+        """Add the posture of a new frame; return why it cannot be used, None if it can."""
         if not all(map(math.isfinite, (now_s, posture.range, posture.pitch, posture.yaw))):
             return None
         push = self._advance(now_s, posture.yaw, state)

@@ -42,10 +42,7 @@ class ThrustMap:
     layout: Layout = Layout.VECTORED
 
     def __post_init__(self) -> None:
-        """Refuse maps that cannot be inverted.
-
-        Raises `OptionError` if a thrust is not positive or a share none.
-        """
+        """Raise `OptionError` if a thrust is not positive or a share none: no inverse exists."""
         if not (min(self.forward, self.backward) > 0.0 and self.right >= 0.0):
             raise OptionError(
                 f"thrust: forward {self.forward:g}, backward {self.backward:g}, right "
@@ -59,8 +56,12 @@ class ThrustMap:
 
     def effort(self, share: float) -> float:
         """Return the effort for a share of the full thrust, both -1 to 1."""
-        size = min(abs(share), 1.0)
-        return math.copysign(self._past_dead_band(size), share) if size > 0.0 else 0.0
+        size, bent = min(abs(share), 1.0), 1.0 - self.linear
+        if not size > 0.0:
+            return 0.0
+        # Root of bent x² + linear x = size, in the form that is valid for bent = 0.
+        x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
+        return math.copysign(self.dead_band + (1.0 - self.dead_band) * x, share)
 
     def share(self, effort: float) -> float:
         """Return the share of the full thrust that an effort gives, both -1 to 1."""
@@ -99,12 +100,6 @@ class ThrustMap:
         ahead, aside = self.joined(*map(self.share, self.split(forward, right)))
         return ahead * (self.forward if ahead > 0.0 else self.backward), aside * self.right
 
-    def _past_dead_band(self, size: float) -> float:
-        bent = 1.0 - self.linear
-        # Root of bent x² + linear x = size, in the form that is valid for bent = 0.
-        x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
-        return self.dead_band + (1.0 - self.dead_band) * x
-
 
 class DeadBandCrossing:
     """Effort of one pair of thrusters, whose dead band is crossed once, with hysteresis.
@@ -114,12 +109,7 @@ class DeadBandCrossing:
     is owed is taken off the thrust that follows on the side in force: so the mean thrust is the one
     asked for, and noise about zero neither crosses nor pushes.
 
-    Parameters
-    ----------
-    impulse : float
-        Share of the full thrust, times seconds.
-    great : float
-        Share of the full thrust that crosses at once.
+    `impulse`: share of the full thrust, times seconds. `great`: share that crosses at once.
     """
 
     def __init__(self, thrust: ThrustMap, impulse: float, great: float) -> None:
@@ -207,10 +197,7 @@ class VehicleFacts:
     dome_forward: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse impossible vehicles.
-
-        Raises `OptionError` if a number is not positive.
-        """
+        """Raise `OptionError` if a number is not positive."""
         check_positive(f"vehicle {self.name}", self, "mass", "turning_rate", "climb_rate")
         for drag in (self.forward_drag, self.right_drag):
             if not (min(drag.linear, drag.quadratic) >= 0.0 < drag.linear + drag.quadratic):
@@ -259,10 +246,7 @@ class RangeGains:
     swell_damping: float = 0.15
 
     def __post_init__(self) -> None:
-        """Refuse gains that are not positive; integral and swell may be 0.
-
-        Raises `OptionError` naming the first.
-        """
+        """Raise `OptionError` naming the first gain that is negative, or 0 where it must not be."""
         free = ("integral", "lag", "swell", "crossing_impulse", "crossing_share")
         check_positive("range", self, *(name for name in self.__slots__ if name not in free))
         check_not_negative("range", self, *free)
@@ -290,10 +274,7 @@ class YawGains:
     quiet_rate: float = math.radians(0.8)
 
     def __post_init__(self) -> None:
-        """Refuse gains that are not positive; integral, derivative and lag may be 0.
-
-        Raises `OptionError` naming the first.
-        """
+        """Raise `OptionError` naming the first gain that is negative, or 0 where it must not be."""
         free = ("integral", "derivative", "lag", "quiet_rate")
         check_positive("yaw", self, *(name for name in self.__slots__ if name not in free))
         check_not_negative("yaw", self, *free)
@@ -312,10 +293,7 @@ class ControlGains:
     memory: float = 10.0
 
     def __post_init__(self) -> None:
-        """Refuse times that are not positive.
-
-        Raises `OptionError` naming the first.
-        """
+        """Raise `OptionError` naming the first time that is not positive."""
         check_positive("controller", self, "rate_time", "memory")
 
 

@@ -26,7 +26,7 @@ of a loop from instability, among them the delay and the gain that may still be 
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -267,10 +267,7 @@ class TuneOptions:
     least_yaw_modulus: float = 0.45
 
     def __post_init__(self) -> None:
-        """Refuse impossible values.
-
-        Raises `OptionError` naming the value.
-        """
+        """Raise `OptionError` naming the value that is impossible."""
         # Greatest delays and frame intervals in seconds, and greatest current in m/s.
         max_s, max_current = 60.0, 10.0
         if not 0.0 <= self.delay <= self.greatest_delay <= max_s:
@@ -443,15 +440,12 @@ def _range_worst(
     facts: VehicleFacts, lag: float, gains: RangeGains, delay: float, options: TuneOptions
 ) -> Margins:
     whole = delay + 0.5 * options.frame
+    m, d = options.mass_factor, options.drag_factor
+    corners = itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))
     return worst(
         margins(_range_loop(facts, lag, gains, whole, current, mass, drag))
-        for mass, drag, current in _corners(options)
+        for mass, drag, current in corners
     )
-
-
-def _corners(options: TuneOptions) -> Iterator[tuple[float, float, float]]:
-    m, d = options.mass_factor, options.drag_factor
-    return itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))
 
 
 def _yaw_loop(lag: float, gains: YawGains, delay: float) -> Loop:

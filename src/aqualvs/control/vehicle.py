@@ -25,12 +25,8 @@ class Setpoint:
 class SetpointHolder:
     """One setpoint for all threads; None until somebody sets it.
 
-    Parameters
-    ----------
-    working_range : (float, float)
-        A range outside of it cannot be measured, so it cannot be held, in metres.
-    followed : bool, optional
-        Whether a controller follows it; else it is only what a pilot steers by.
+    `working_range`: a range outside of it, in metres, cannot be measured, so it cannot be held.
+    `followed`: whether a controller follows it; else it is only what a pilot steers by.
     """
 
     MAX_YAW = math.radians(45.0)
