@@ -242,15 +242,15 @@ def thruster_measures(log: LoopLog, start_s: float = 0.0) -> EffortMeasures:
     forward effort changes sign with the noise, but no thruster reverses.
     """
     forward, right = log.column("forward"), log.column("right")
-    pairs = [
-        _measured(log, efforts, start_s, math.inf) for efforts in (forward + right, forward - right)
-    ]
+    one, other = (_measured(log, pair, start_s) for pair in (forward + right, forward - right))
     return EffortMeasures(
-        reversals=max(one.reversals for one in pairs), jumps=max(one.jumps for one in pairs)
+        reversals=max(one.reversals, other.reversals), jumps=max(one.jumps, other.jumps)
     )
 
 
-def _measured(log: LoopLog, efforts: FloatArray, start_s: float, end_s: float) -> EffortMeasures:
+def _measured(
+    log: LoopLog, efforts: FloatArray, start_s: float, end_s: float = math.inf
+) -> EffortMeasures:
     here = _between(log, start_s, end_s)
     efforts, time_s = efforts[here], log.column("time_s")[here]
     minutes = max((time_s[-1] - time_s[0]) / 60.0, 1e-9) if len(time_s) else math.inf
@@ -265,14 +265,8 @@ def step_measures(
 ) -> StepMeasures:
     """Return settling time and overshoot of a step.
 
-    Parameters
-    ----------
-    time_s, ranges : array, shape (n,)
-        Times in seconds, and true ranges in metres or their mean over several runs.
-    step_s : float
-        Time at which the setpoint changed.
-    before, after : float
-        Setpoints in metres.
+    `time_s`, `ranges`, shape (n,): times in seconds, and true ranges in metres or their mean over
+    several runs. `step_s`: when the setpoint changed from `before` to `after`, in metres.
     """
     later = time_s > step_s
     share = (ranges[later] - before) / (after - before)

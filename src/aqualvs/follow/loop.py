@@ -26,10 +26,7 @@ from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 
 
 class SimulatedLink:
-    """Link to a simulated vehicle, in simulated time.
-
-    `vehicle`: its latency is that of the link.
-    """
+    """Link to a simulated vehicle, whose latency is that of the link, in simulated time."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self.vehicle = vehicle
@@ -37,7 +34,6 @@ class SimulatedLink:
         self.effort = NEUTRAL  # Last effort sent.
         self._shaping = shaping_of_model(vehicle.model)
         self._unsent: Effort | None = None
-        self._closed = False
 
     def state(self) -> VehicleState:
         """Return the vehicle's reported state, by the vehicle's clock."""
@@ -56,9 +52,8 @@ class SimulatedLink:
 
     def send(self, effort: Effort) -> None:
         """Send an effort to the vehicle."""
-        if not self._closed:
-            self.effort = effort
-            self._unsent = self._shaping.position(effort)
+        self.effort = effort
+        self._unsent = self._shaping.position(effort)
 
     def pass_time(self, until_s: float) -> None:
         """Simulate the vehicle until a time; do nothing if that has passed."""
@@ -66,11 +61,6 @@ class SimulatedLink:
         if step > 1e-9:
             self.vehicle.step(self._unsent, step)
             self._unsent = None
-
-    def close(self) -> None:
-        """Send neutral; further calls do nothing."""
-        self.send(NEUTRAL)
-        self._closed = True
 
 
 # As in the live run: time after which a silent stream is reported, and periods of further reports
@@ -133,14 +123,7 @@ class _Sight:
 class SimulatedLoop:
     """Simulation of a vehicle in front of a net, steered by what its lasers measure.
 
-    Parameters
-    ----------
-    link : SimulatedLink
-    net : NetWall
-    sensor : RangeSensor
-    steering : NetPilot
-        Pilot; it is engaged at the start.
-    timing : Timing, optional
+    `steering`: the pilot, which is engaged at the start.
     """
 
     def __init__(
@@ -278,11 +261,7 @@ class SimulatedLoop:
         effort = self.link.effort
         return LoopRow(
             time_s=now_s,
-            range=truth.range,
-            pitch=truth.pitch,
-            yaw=truth.yaw,
-            along=truth.along,
-            up=truth.up,
+            **truth._asdict(),
             clearance=self.net.clearance(vehicle.pose, vehicle.model.half_size, now_s),
             tilt=math.acos(min(max(float(vehicle.pose.rotation[2, 2]), -1.0), 1.0)),
             measured_range=measured.range if measured else math.nan,

@@ -39,19 +39,9 @@ class RenderedSensor:
     between this frame and the previous one; the frame's time is the end of the readout. Frames of
     an interlaced camera are its single fields.
 
-    Parameters
-    ----------
-    net : NetWall
-    rig : Rig
-        Rig that takes and measures the pictures.
-    rng : Generator
-        Source of the sensor's noise.
-    scene : Scene, optional
-        Scene in the frame of the net at rest; `net_scene` if left out.
-    camera : SimulatedCamera
-        Camera that takes the pictures; its compression is left out.
-    freeze_s : float
-        Time from which on the last picture is repeated, with time stamps that advance.
+    `rig`: takes and measures the pictures. `scene`: in the frame of the net at rest; `net_scene` if
+    left out. `camera`: its compression is left out. `freeze_s`: time from which on the last picture
+    is repeated, with time stamps that advance.
     """
 
     def __init__(
@@ -164,16 +154,8 @@ class PostureNoise:
 class SampledSensor:
     """Sensor that returns the true posture with noise.
 
-    Parameters
-    ----------
-    net : NetWall
-    rng : Generator
-        Source of the noise.
-    noise : PostureNoise, optional
-    blind : sequence of Blind
-        Periods without sight.
-    working_range : (float, float)
-        Range in metres outside which there is no posture.
+    `blind`: periods without sight. `working_range`: range in metres outside which there is no
+    posture.
     """
 
     def __init__(
