@@ -4,7 +4,7 @@ The poses are of boards before the bare camera and on a rail before the dome, of
 a box of markers, and of a plate in the view.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,16 +40,7 @@ _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 def board_across(rig: Rig, size: Size, count: int, rng: np.random.Generator) -> list[SE3]:
     """Return `dome_from_board` of a board all over a bare camera's picture, mostly tilted.
 
-    Parameters
-    ----------
-    rig : Rig
-        Its lens and its place; the dome plays no part.
-    size : (float, float)
-        Width and height of the board's squares, in metres.
-    count : int
-        Number of poses.
-    rng : Generator
-        Random number generator.
+    `rig`: the dome plays no part. `size`: width and height of the board's squares, in metres.
     """
     poses = []
     # Widths of the board as shares of the picture's, in turn.
@@ -72,22 +63,11 @@ def board_on_rail(
 ) -> tuple[list[SE3], list[float]]:
     """Return `dome_from_board` of a board that is carried along the dome's y axis.
 
-    Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted.
+    Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted. The
+    second list has the distances along the y axis to each board's plane, in metres.
 
-    Parameters
-    ----------
-    size : (float, float)
-        Width and height of the board's squares, in metres.
-    distances : array, shape (N,)
-        Of the board's middle, in metres.
-    rng : Generator
-        Random number generator.
-
-    Returns
-    -------
-    poses : list of SE3
-    measured : list of float
-        Distance along the y axis to each board's plane, in metres.
+    `size`: width and height of the board's squares, in metres. `distances`, shape (N,): of the
+    board's middle, in metres.
     """
     poses, measured = [], []
     for k, distance in enumerate(distances):
@@ -118,14 +98,8 @@ def vehicle_in_box(count: int, rng: np.random.Generator) -> list[SE3]:
 def plate_in_view(rig: Rig, size: Size, far: float) -> SE3:
     """Return `dome_from_plate` of a plate in the quarter of the view farthest from the lasers.
 
-    Parameters
-    ----------
-    rig : Rig
-        In its water.
-    size : (float, float)
-        Width and height of the plate, in metres.
-    far : float
-        Distance of its middle from the dome's outside, in metres.
+    `rig`: in its water. `size`: width and height of the plate, in metres. `far`: distance of its
+    middle from the dome's outside, in metres.
     """
     turn = rotation_from_rotvec(np.deg2rad([3.0, 1.0, 6.0])) @ DOME_FROM_CAM_NOMINAL
     rays = rig.camera().rays(np.array(_QUARTERS) * rig.size_px - 0.5)
@@ -219,14 +193,8 @@ def squares_size(board: CharucoPrint) -> tuple[float, float]:
 def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Panel:
     """Return a large mottled panel to stand behind everything, placed by its middle.
 
-    Parameters
-    ----------
-    dome_from_ground : SE3
-        x to the right, y down.
-    cell : float
-        Side of its 800 x 600 cells, in metres.
-    shift : int
-        Offset in the noise.
+    `dome_from_ground`: x to the right, y down. `cell`: side of its 800 x 600 cells, in metres.
+    `shift`: offset in the noise.
     """
     texture = Texture(mottled((600, 800), 0.26, 0.45, scale=1.6, shift=shift), cell)
     width, height = texture.size
@@ -301,8 +269,8 @@ def _prints(first: int, places: IntArray, side: int, ring: int) -> MarkerPrint:
 
 def moved(marked: Marked, dome_from_own: SE3) -> Marked:
     """Return a marked panel carried into another frame."""
-    panel = Panel(dome_from_own @ marked.panel.dome_from_panel, marked.panel.texture)
-    return Marked(marked.name, panel, marked.prints)
+    panel = replace(marked.panel, dome_from_panel=dome_from_own @ marked.panel.dome_from_panel)
+    return replace(marked, panel=panel)
 
 
 def board_mapping(board: CharucoPrint) -> dict[str, Any]:

@@ -144,20 +144,9 @@ class Development:
         t: float,
         rng: np.random.Generator | None,
     ) -> NDArray[np.uint8]:
-        """Return the picture (height, width, 3), red, green, blue, before it is compressed.
+        """Return the picture before it is compressed; see `SimulatedCamera.picture`.
 
-        Parameters
-        ----------
-        radiance : float32 array, shape (height, width, 3)
-            Before the lens, in the bands of `ColourFilters`; black where no light comes through.
-        water : WaterOptics
-            Its halo.
-        filters : ColourFilters
-            Of the sensor.
-        t : float
-            In seconds; exposure and white balance drift with it.
-        rng : Generator or None
-            None leaves noise out.
+        `water`: its halo is used. `filters`: of the sensor.
         """
         lens = CameraSensor(defocus_px=self.defocus_px)
         light = spread(radiance, water, lens)
@@ -224,8 +213,8 @@ class SimulatedCamera:
         """Return a scene with the camera's own lamps on."""
         if self.development is None or not any(self.development.lamp):
             return scene
-        both = np.add(scene.water.ambient, self.development.lamp)
-        ambient = float(both[0]), float(both[1]), float(both[2])
+        red, green, blue = np.add(scene.water.ambient, self.development.lamp).tolist()
+        ambient = (red, green, blue)
         return replace(scene, water=replace(scene.water, ambient=ambient))
 
     def picture(
@@ -241,13 +230,14 @@ class SimulatedCamera:
         Parameters
         ----------
         radiance : float32 array, shape (height, width, 3)
-            Radiance before the lens, rendered with this camera's `filters`.
+            Before the lens, rendered with this camera's `filters`; black where no light comes
+            through.
         water : WaterOptics
             Its halo.
         sensor : CameraSensor
             The scene's; used by the ideal camera only.
         t : float
-            Time in seconds.
+            Time in seconds, with which exposure and white balance drift.
         rng : Generator, optional
             Source of noise; without it there is none.
         """
@@ -264,8 +254,7 @@ def _blurred(image: Rgb, sigmas: tuple[float, float]) -> Rgb:
     """Return a picture blurred along x and y; a sigma of 0 leaves a direction alone."""
     if not any(sigmas):
         return image
-    kernels = [_bell(sigma) for sigma in sigmas]
-    return np.asarray(cv2.sepFilter2D(image, -1, kernels[0], kernels[1]))
+    return np.asarray(cv2.sepFilter2D(image, -1, *map(_bell, sigmas)))
 
 
 def _bell(sigma: float) -> NDArray[np.float32]:
@@ -372,10 +361,7 @@ CAMERAS: Mapping[str, SimulatedCamera] = MappingProxyType(
 
 
 def simulated_camera(name: str) -> SimulatedCamera:
-    """Return a camera by its name.
-
-    Raises `OptionError` if there is none of that name.
-    """
+    """Return a camera by its name; raise `OptionError` if there is none of that name."""
     if name not in CAMERAS:
         raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(CAMERAS)}")
     return CAMERAS[name]

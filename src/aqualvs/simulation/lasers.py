@@ -167,7 +167,6 @@ def _source_on(laser: Laser, rig: Rig) -> LaserSource:
 
     Behind a window it is the rig's source.
     """
-    wavelength_nm = laser_wavelength_nm(laser)
     normal = laser.plane.normal
     forward = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     length = float(np.linalg.norm(forward))
@@ -178,12 +177,12 @@ def _source_on(laser: Laser, rig: Rig) -> LaserSource:
         )
     forward /= length
     if laser.window is not None:
-        source = sheet_in(laser, rig.n_air, rig.n_water).source
-        return LaserSource(position=source, direction=forward, wavelength_nm=wavelength_nm)
-    foot = normal * laser.plane.offset
-    back = (foot[1] - 0.01) / forward[1]
+        position = sheet_in(laser, rig.n_air, rig.n_water).source
+    else:
+        foot = normal * laser.plane.offset
+        position = foot - (foot[1] - 0.01) / forward[1] * forward
     return LaserSource(
-        position=foot - back * forward, direction=forward, wavelength_nm=wavelength_nm
+        position=position, direction=forward, wavelength_nm=laser_wavelength_nm(laser)
     )
 
 
@@ -345,16 +344,10 @@ def add_colour(seen: Vec, light: float, sheets: Sheets, i: int) -> Vec:
 
 
 def light_on_points(points: FloatArray, sheets: Sheets, attenuation: Vec) -> FloatArray:
-    """Return the laser light on free-floating points, shape (n, 3) in, (n, 3) out.
+    """Return the laser light (n, 3) on free-floating points (n, 3) in `dome`, in metres.
 
-    Parameters
-    ----------
-    points : array, shape (n, 3)
-        In `dome`, in metres.
-    sheets : Sheets
-        With the distances at which surfaces end them.
-    attenuation : (float, float, float)
-        Of the water per metre, for red, green and blue.
+    `sheets`: with the distances at which surfaces end them. `attenuation`: of the water per metre,
+    for red, green and blue.
     """
     light = np.zeros((len(points), 3))
     _light_on_points(np.ascontiguousarray(points), sheets, attenuation, light)

@@ -114,17 +114,12 @@ def _pack_fish(fish: Fish, pose: SE3, t: float) -> list[FloatArray]:
         (centre - bend @ [1.1 * size, 0.0, 0.0], bend, (0.24, 0.02, 0.30), _TAIL),
         (centre + turn @ [0.78 * size, 0.0, 0.05 * size], turn, (0.045, 0.13, 0.045), _EYE),
     ]
-    return [
-        _pack_ellipsoid(pose.apply(c), pose.rotation @ r, size * np.array(s), fish.albedo, part)
-        for c, r, s, part in parts
-    ]
-
-
-def _pack_ellipsoid(
-    centre: FloatArray, axes: FloatArray, half: FloatArray, albedo: Vec, part: float
-) -> FloatArray:
-    unit_from_dome = axes.T / half[:, None]
-    return np.concatenate([centre, unit_from_dome.ravel(), albedo, [part]])
+    rows = []
+    for place, axes, half, part in parts:
+        unit_from_dome = (pose.rotation @ axes).T / (size * np.array(half))[:, None]
+        albedo_and_part = [*fish.albedo, part]
+        rows.append(np.concatenate([pose.apply(place), unit_from_dome.ravel(), albedo_and_part]))
+    return rows
 
 
 def _pack_box(box: Box, pose: SE3) -> FloatArray:
@@ -266,16 +261,8 @@ def _wall_albedo(p: Vec, walls: FloatArray, i: int, tiles: Tiles) -> Vec:
 def _fish_skin(p: Vec, ellipsoids: FloatArray, i: int, tiles: Tiles) -> tuple[Vec, Vec]:
     """Return normal and skin: dark back, pale belly, scales; a dark eye; a striped tail."""
     q = _to_local(minus(p, row3(ellipsoids, i, _CENTRE)), ellipsoids, i)
-    normal = unit(
-        combine(
-            row3(ellipsoids, i, _ROWS),
-            q[0],
-            row3(ellipsoids, i, _ROWS + 3),
-            q[1],
-            row3(ellipsoids, i, _ROWS + 6),
-            q[2],
-        )
-    )
+    a, b = row3(ellipsoids, i, _ROWS), row3(ellipsoids, i, _ROWS + 3)
+    normal = unit(combine(a, q[0], b, q[1], row3(ellipsoids, i, _ROWS + 6), q[2]))
     albedo = row3(ellipsoids, i, 12)
     if ellipsoids[i, _PART] == _EYE:
         return normal, scaled(albedo, 0.08)

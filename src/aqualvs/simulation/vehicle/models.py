@@ -7,7 +7,7 @@ all three sources have them. The vehicles are fully under water.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.simulation.vehicle.water_motion import GRAVITY
 
 Six: TypeAlias = tuple[float, float, float, float, float, float]
+Numbers = TypeVar("Numbers", Vec, Six)
 
 _COS45 = math.sqrt(0.5)
 # Least share of a thruster's unit force or lever in a motion that it takes part in.
@@ -80,18 +81,11 @@ class StickInput:
             raise OptionError(f"sticks: gain {self.gain:g}; choose more than 0, at most 1")
 
     def asked(self, x: int, y: int, z: int, r: int) -> tuple[float, float, float, float]:
-        """Return the request of stick positions in depth hold.
+        """Return the request (forward, right, down, turn) of stick positions in depth hold.
 
-        Parameters
-        ----------
-        x, y, z, r : int
-            As in MANUAL_CONTROL: z from 0 (down) over 500 to 1000 (up).
-
-        Returns
-        -------
-        forward, right, down, turn : float
-            Shares of the thrusters' motor input, of the greatest rate of descent and of the
-            greatest turning rate.
+        These are shares of the thrusters' motor input, of the greatest rate of descent and of the
+        greatest turning rate. The sticks are as in MANUAL_CONTROL: z from 0 (down) over 500 to
+        1000 (up).
         """
         yaw_trim, *level = self.trims
         forward, right = (
@@ -214,17 +208,16 @@ class VehicleModel:
         return replace(
             self,
             mass=self.mass * mass,
-            inertia=_scaled3(self.inertia, mass),
+            inertia=_scaled(self.inertia, mass),
             buoyancy=self.buoyancy + (mass - 1.0) * self.weight,
-            linear_drag=_scaled6(self.linear_drag, drag),
-            quadratic_drag=_scaled6(self.quadratic_drag, drag),
+            linear_drag=_scaled(self.linear_drag, drag),
+            quadratic_drag=_scaled(self.quadratic_drag, drag),
         )
 
     def allocation(self) -> FloatArray:
         """Return force and moment on the body by unit thrust of every thruster, shape (6, n)."""
-        positions = np.array([one.position for one in self.thrusters])
         directions = np.array([one.direction for one in self.thrusters])
-        moments = np.cross(positions, directions)
+        moments = np.cross([one.position for one in self.thrusters], directions)
         return np.ascontiguousarray(np.vstack([directions.T, moments.T]))
 
     def mixing(self) -> FloatArray:
@@ -251,14 +244,8 @@ def _sign(values: FloatArray) -> FloatArray:
     return np.where(np.abs(values) > _TAKES_PART, np.sign(values), 0.0)
 
 
-def _scaled3(values: Vec, factor: float) -> Vec:
-    a, b, c = (factor * value for value in values)
-    return a, b, c
-
-
-def _scaled6(values: Six, factor: float) -> Six:
-    a, b, c, d, e, f = (factor * value for value in values)
-    return a, b, c, d, e, f
+def _scaled(values: Numbers, factor: float) -> Numbers:
+    return cast(Numbers, tuple(factor * value for value in values))
 
 
 def _level_four(x: float, y: float, z: float) -> tuple[Thruster, ...]:

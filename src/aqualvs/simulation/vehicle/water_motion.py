@@ -184,12 +184,7 @@ _GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 def tether_force(stream: Vec, velocity: Vec, flow: Flow) -> Vec:
     """Return the force of the tether on the vehicle, in the world, in newtons.
 
-    Parameters
-    ----------
-    stream, velocity : (float, float, float)
-        Of the water without waves, and of the vehicle, in the world, in m/s.
-    flow : Flow
-        With the tether.
+    `stream`, `velocity`: of the water without waves, and of the vehicle, in the world, in m/s.
     """
     north, east = 0.0, 0.0
     for i in range(3):
