@@ -375,7 +375,10 @@ class RangeYawController:
         self._time_s = time_s
         self._range_ramp.step(setpoint.range, step)
         self._yaw_ramp.step(setpoint.yaw, step)
-        turn = self._turning(time_s, yaw, yaw_rate)
+        # The derivative acts on the measurement; the ramp's own rate is added back.
+        ramp = self._yaw_ramp
+        ahead = ramp.rate + self.gains.yaw.derivative * ramp.seen_rate
+        turn = -self._turn.update(time_s, ramp.seen, yaw, yaw_rate, ahead)
         forward, right = self._forces(step, range, yaw, rate, sway, turn)
         self._effort = self._as_effort(step, forward, right, turn, down)
         return self._effort
@@ -395,13 +398,6 @@ class RangeYawController:
         self._range_ramp.start(range)
         self._yaw_ramp.start(yaw)
         self._time_s, self._running = time_s, True
-
-    def _turning(self, time_s: float, yaw: float, yaw_rate: float | None) -> float:
-        """Return the turning rate asked for, clockwise."""
-        ramp = self._yaw_ramp
-        # The derivative acts on the measurement; the ramp's own rate is added back.
-        forward = ramp.rate + self.gains.yaw.derivative * ramp.seen_rate
-        return -self._turn.update(time_s, ramp.seen, yaw, yaw_rate, forward)
 
     def _forces(
         self, step: float, range: float, yaw: float, rate: float, sway: float, turn: float

@@ -109,16 +109,12 @@ class Coverage:
         by_bearing = len(rows) > 0 and bool(np.isfinite(rows[:, 2]).all())
         across = Across.BEARING if by_bearing else Across.ALONG
         places = _joined(rows[:, 2]) if by_bearing else rows[:, 3]
-        aside = self._aside(rows[:, 5], across)
+        # How far to either side is seen, in the unit of the map.
+        aside = self.options.seen_aside * rows[:, 5]
+        if by_bearing:
+            radius = self.options.radius
+            aside = np.zeros(len(rows)) if radius is None else aside / radius
         return _grid(rows, places, aside, across, self.options)
-
-    def _aside(self, ranges: FloatArray, across: Across) -> FloatArray:
-        """Return how far to either side is seen, in the unit of the map."""
-        metres = self.options.seen_aside * ranges
-        if across is Across.ALONG:
-            return metres
-        radius = self.options.radius
-        return np.zeros(len(ranges)) if radius is None else metres / radius
 
 
 def _joined(bearings: FloatArray) -> FloatArray:

@@ -13,30 +13,10 @@ from aqualvs.errors import OutputError
 from aqualvs.scanning.posture import Posture, Refusal
 
 FOLLOW_COLUMNS = (
-    "time_s",
-    "frame_time_s",
-    "engaged",
-    "stage",
-    "reason",
-    "posture",
-    "range_m",
-    "pitch_deg",
-    "yaw_deg",
-    "range_setpoint_m",
-    "yaw_setpoint_deg",
-    "range_error_m",
-    "yaw_error_deg",
-    "sway_m_s",
-    "down_m_s",
-    "forward",
-    "right",
-    "down",
-    "yaw",
-    "armed",
-    "mode",
-    "depth_m",
-    "heading_deg",
-    "bearing_deg",
+    *("time_s", "frame_time_s", "engaged", "stage", "reason"),
+    *("posture", "range_m", "pitch_deg", "yaw_deg", "range_setpoint_m", "yaw_setpoint_deg"),
+    *("range_error_m", "yaw_error_deg", "sway_m_s", "down_m_s", "forward", "right", "down", "yaw"),
+    *("armed", "mode", "depth_m", "heading_deg", "bearing_deg"),
 )
 """`posture` is "valid" or the reason of a refusal; errors are measured less wanted. Unknown values
 are empty."""
@@ -116,7 +96,7 @@ def follow_row(
         "yaw": f"{effort.yaw:.4f}",
         "armed": str(int(state.armed)),
         "mode": state.mode_name or state.mode.value,
-        "depth_m": _number(state.depth, 3),
+        "depth_m": "" if state.depth is None else f"{state.depth:.3f}",
         "heading_deg": _degrees(state.heading),
     }
     return row | _seen(posture, decision, state)
@@ -145,10 +125,6 @@ def _seen(
         row["range_error_m"] = f"{posture.range - wanted.range:.5f}"
         row["yaw_error_deg"] = _degrees(posture.yaw - wanted.yaw)
     return row
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
 
 
 def _degrees(angle: float | None) -> str:

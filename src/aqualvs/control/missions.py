@@ -344,9 +344,10 @@ class SurveyMission(Mission):
         if over or lost is not None:
             return guidance_along(self.setpoint, 0.0, lost, over)
         if self._leg is None and not self._depth_reached(state):
-            return Guidance(
-                setpoint=self.setpoint, down=self._descent(state), stage=Stage.CHANGING_DEPTH
-            )
+            down = 0.0
+            if state.depth is not None and math.isfinite(state.depth):
+                down = clipped(_DESCENT_GAIN * (self.depth - state.depth), self._options.descent)
+            return Guidance(setpoint=self.setpoint, down=down, stage=Stage.CHANGING_DEPTH)
         return self._along(posture, state)
 
     def _along(self, posture: Posture | None, state: VehicleState) -> Guidance:
@@ -365,12 +366,6 @@ class SurveyMission(Mission):
         self._leg = None
         self._changing_s = self._steady_s = 0.0
         self._allowed_s = math.inf
-
-    def _descent(self, state: VehicleState) -> float:
-        """Return the speed of descent towards the leg's depth."""
-        if state.depth is None or not math.isfinite(state.depth):
-            return 0.0
-        return clipped(_DESCENT_GAIN * (self.depth - state.depth), self._options.descent)
 
     def _depth_reached(self, state: VehicleState) -> bool:
         # Seconds that a depth must be kept before the next leg, longer than a wave.

@@ -318,8 +318,15 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     def of_yaw(k: float) -> YawGains:
         return _yaw_gains(k, turn.lag() + usual)
 
+    m, d = options.mass_factor, options.drag_factor
+    corners = [*itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))]
+
     def range_worst(of: RangeGains, delay: float) -> Margins:
-        return _range_worst(facts, lag, of, delay, options)
+        whole = delay + 0.5 * options.frame
+        return worst(
+            margins(_range_loop(facts, lag, of, whole, current, mass, drag))
+            for mass, drag, current in corners
+        )
 
     def range_is_enough(k: float) -> bool:
         of = of_range(k)
@@ -434,18 +441,6 @@ def _range_loop(
     above = np.polyadd(above, ahead * np.convolve([1.0, 0.0], swell)) / mass
     below = np.convolve(np.convolve([1.0, damping, 0.0, 0.0], [lag, 1.0]), swell)
     return Loop(np.asarray(above, np.float64), below, delay)
-
-
-def _range_worst(
-    facts: VehicleFacts, lag: float, gains: RangeGains, delay: float, options: TuneOptions
-) -> Margins:
-    whole = delay + 0.5 * options.frame
-    m, d = options.mass_factor, options.drag_factor
-    corners = itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))
-    return worst(
-        margins(_range_loop(facts, lag, gains, whole, current, mass, drag))
-        for mass, drag, current in corners
-    )
 
 
 def _yaw_loop(lag: float, gains: YawGains, delay: float) -> Loop:
