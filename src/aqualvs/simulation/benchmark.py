@@ -205,20 +205,16 @@ def _definitions() -> list[tuple[str, str, dict[str, Any]]]:
     parts = packaged("benchmark.yaml")
     for level, courses in parts["levels"].items():
         for course, over in courses.items():
-            content = _laid_over(parts["targets"].get(course, {}), over)
+            base = parts["targets"].get(course, {})
+            content = {**base, **over}
+            if "net" in base and "net" in over:
+                # The net is laid over key by key.
+                content["net"] = {**base["net"], **over["net"]}
             content["motion"] = content.get("motion", parts["courses"].get(course, {}))
             timing = {"duration_s": duration_s, "fps": N_FRAMES / duration_s}
             seed = 1000 + len(found)
             found.append((f"{level}_{course}", level, {**timing, "seed": seed, **content}))
     return found
-
-
-def _laid_over(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return a mapping with another's values over its own; the net is laid over key by key."""
-    merged = {**base, **over}
-    if "net" in base and "net" in over:
-        merged["net"] = {**base["net"], **over["net"]}
-    return merged
 
 
 def _rounded(value: Any) -> Any:

@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
@@ -115,7 +114,11 @@ class _Job:
         between_stills_s = 4.0
         for scene, file in zip(scenes, names, strict=True):
             image = renderer.render(scene, rng, between_stills_s * self.done)
-            _write_picture(folder / file, image, quality)
+            if quality is None:
+                data = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+            else:
+                data = jpeg(image, quality)
+            (folder / file).write_bytes(data)
             # Pictures of an earlier set by another camera.
             (folder / file).with_suffix(".png" if quality else ".jpg").unlink(missing_ok=True)
             self.did_one()
@@ -225,8 +228,22 @@ def _simulate(job: _Job) -> CalibrationFiles:
     box, box_file = _box(job)
     index, target = _index(job)
     dive, dive_truth = _dive(job)
-    pictures, files = (camera, dome, box, index), (board, rail_board, poses, box_file, target)
-    return CalibrationFiles(nominal, *pictures, *files, dive, dive_truth, rig, job.done)
+    return CalibrationFiles(
+        nominal=nominal,
+        camera=camera,
+        dome=dome,
+        box=box,
+        index=index,
+        board=board,
+        rail_board=rail_board,
+        poses=poses,
+        box_file=box_file,
+        target=target,
+        dive=dive,
+        dive_truth=dive_truth,
+        rig=rig,
+        n_pictures=job.done,
+    )
 
 
 def _camera_air(job: _Job) -> tuple[Path, Path]:
@@ -344,13 +361,6 @@ def _nominal_mapping(rig: Rig) -> dict[str, Any]:
         lasers["wavelength_nm"] = float(light_nm)
     content |= {"n_air": float(rig.n_air), "lasers": lasers}
     return {**content, "working_range_mm": [targets.to_mm(far) for far in rig.working_range]}
-
-
-def _write_picture(path: Path, image: NDArray[np.uint8], jpeg_quality: int | None) -> None:
-    if jpeg_quality is None:
-        path.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
-    else:
-        path.write_bytes(jpeg(image, jpeg_quality))
 
 
 def _write_poses(path: Path, names: Sequence[str], poses: Sequence[SE3]) -> None:

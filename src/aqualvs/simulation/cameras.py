@@ -254,7 +254,8 @@ def _blurred(image: Rgb, sigmas: tuple[float, float]) -> Rgb:
     """Return a picture blurred along x and y; a sigma of 0 leaves a direction alone."""
     if not any(sigmas):
         return image
-    return np.asarray(cv2.sepFilter2D(image, -1, *map(_bell, sigmas)))
+    x, y = map(_bell, sigmas)
+    return np.asarray(cv2.sepFilter2D(image, -1, x, y))
 
 
 def _bell(sigma: float) -> NDArray[np.float32]:

@@ -213,30 +213,17 @@ def _next_crossing(
         step = max(share * abs(side), _STEPS.step)
         now = _behind(o, d, t + step, nets, i, folds)
         if side * now <= 0.0:
-            return _halved(o, d, t, t + step, side, nets, i, folds)
+            # By bisection, where the ray changes sides of the net.
+            before, after = t, t + step
+            for _ in range(_STEPS.halvings):
+                middle = 0.5 * (before + after)
+                if side * _behind(o, d, middle, nets, i, folds) > 0.0:
+                    before = middle
+                else:
+                    after = middle
+            return after
         t, side = t + step, now
     return np.inf
-
-
-@inline_borrowing_kernel
-def _halved(
-    o: Vec,
-    d: Vec,
-    before: float,
-    after: float,
-    side: float,
-    nets: FloatArray,
-    i: int,
-    folds: FloatArray,
-) -> float:
-    """Return by bisection where a ray changes sides of the net between two places."""
-    for _ in range(_STEPS.halvings):
-        middle = 0.5 * (before + after)
-        if side * _behind(o, d, middle, nets, i, folds) > 0.0:
-            before = middle
-        else:
-            after = middle
-    return after
 
 
 @inline_borrowing_kernel

@@ -57,9 +57,11 @@ def add_snow(
     if scene.water.snow <= 0:
         return
     points, radii = _particles(scene.water.snow, t)
-    ahead = _before_target(points, scene)
-    pixels, valid = camera.project(points[ahead])
-    points, radii = points[ahead][valid], radii[ahead][valid]
+    if scene.target != "none":
+        before = scene.target_plane().signed_distance(points) < 0.0
+        points, radii = points[before], radii[before]
+    pixels, valid = camera.project(points)
+    points, radii = points[valid], radii[valid]
     lit = light_on_points(points, sheets, scene.water.attenuation)
     distance = np.linalg.norm(points, axis=-1)
     reach = np.exp(-np.outer(distance, scene.water.attenuation))
@@ -78,12 +80,6 @@ def _particles(count: int, t: float) -> tuple[FloatArray, FloatArray]:
     turns = start + own * _DRIFT * t / (_HIGH - _LOW)
     radii = rng.uniform(*_RADII, count)
     return _LOW + (turns % 1.0) * (_HIGH - _LOW), radii
-
-
-def _before_target(points: FloatArray, scene: Scene) -> BoolArray:
-    if scene.target == "none":
-        return np.ones(len(points), dtype=np.bool_)
-    return scene.target_plane().signed_distance(points) < 0.0
 
 
 def _pixels_per_radian(camera: Camera) -> float:
