@@ -57,8 +57,7 @@ def _run_video(laboratory: Laboratory) -> ExperimentResult:
 def _variant(laboratory: Laboratory, dive: RenderedDive, name: str, ours: bool = False) -> Variant:
     frames = dive.scenario.n_frames
     rate = 8e-6 * dive.video.stat().st_size * dive.scenario.fps / frames
-    named = Variant(f"{name}, {rate:.1f} Mbit/s", (laboratory.measure(dive),))
-    return replace(named, ours=ours)
+    return Variant(f"{name}, {rate:.1f} Mbit/s", (laboratory.measure(dive),), ours)
 
 
 VIDEO = Experiment(
@@ -223,13 +222,8 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
             ),
             DataColumns(
                 name="ablation_lens",
-                columns={
-                    "lens_error_mm": np.array(_LENS_STEPS_MM),
-                    **{
-                        f"{name}_range_error_percent": row
-                        for name, row in zip(_AXES, lens, strict=True)
-                    },
-                },
+                columns={"lens_error_mm": np.array(_LENS_STEPS_MM)}
+                | dict(zip((f"{name}_range_error_percent" for name in _AXES), lens, strict=True)),
             ),
         ),
         notes=(

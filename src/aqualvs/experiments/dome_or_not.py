@@ -144,14 +144,7 @@ def level_laser(rig: Rig) -> int:
 def distances(measured: MeasuredDive, rig: Rig, laser: int) -> Distances:
     """Return the distances of a wall that is square to the vehicle, from one laser's stripe.
 
-    Parameters
-    ----------
-    measured : MeasuredDive
-        Measured with the dome model.
-    rig : Rig
-        Rig of the measurement.
-    laser : int
-        Index of the laser.
+    `measured`: by `rig`, with the dome model. `laser`: index of the laser.
     """
     rows = []
     for scan, truth in zip(measured.scans, measured.truth[:, 0], strict=True):

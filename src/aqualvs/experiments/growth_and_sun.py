@@ -17,6 +17,7 @@ from aqualvs.experiments.experiment import (
     Experiment,
     ExperimentResult,
     ExperimentRow,
+    draw_dots,
     drawn,
     listed,
 )
@@ -225,15 +226,7 @@ def _draw(figure: Figure, seen: Mapping[str, MeasuredScene]) -> None:
         values = (one.ours.range_percent, degrees)
         for axes, value, bar in zip(errors, values, bars, strict=True):
             axes.axhline(0.0, color="#8a8f98", linewidth=0.7)
-            axes.errorbar(
-                one.ours.time_s,
-                value,
-                yerr=bar,
-                fmt=".",
-                color=_COLOURS[name],
-                markersize=3.5,
-                elinewidth=0.6,
-            )
+            draw_dots(axes, one.ours.time_s, value, bar, _COLOURS[name])
         errors[-1].set_xlabel("time (s)")
     grid[1, 0].set_ylabel("range error (%)")
     grid[2, 0].set_ylabel("yaw error (degrees)")

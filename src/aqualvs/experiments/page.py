@@ -175,14 +175,13 @@ def _sources(folder: Traversable, above: str) -> list[tuple[str, Traversable]]:
 
 
 def _record(content: Mapping[str, Any]) -> Record:
-    texts = {key: str(content[key]) for key in ("name", "title", "paper", "about", "sentence")}
+    texts = ("name", "title", "paper", "about", "sentence", "failure")
     return Record(
-        **texts,
+        **{key: str(content[key]) for key in texts},
         findings=tuple(ExperimentRow(**one) for one in content["findings"]),
         pictures=tuple(PrintedFigure(**one) for one in content["pictures"]),
         series=tuple(content["series"]),
         notes=tuple(content["notes"]),
-        failure=str(content["failure"]),
     )
 
 
@@ -264,7 +263,7 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
         "results": RESULTS,
         "records": records,
         "times": {name: duration(seconds[name]) for name in seconds},
-        "with_bar": _with_bar(records),
+        "with_bar": with_bar(records),
         "bar_text": _bar_text,
         "picture": lambda printed: _picture(printed, folder),
         "cards": html.cards(_cards(records, seconds)),
@@ -274,7 +273,7 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
 
 
 def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[Card]:
-    bars = [finding.met for _, finding in _with_bar(records)]
+    bars = [finding.met for _, finding in with_bar(records)]
     done = sum(not record.failure for record in records)
     took = sum(seconds.get(record.name, 0.0) for record in records)
     yield Card("bars met", f"{sum(map(bool, bars))} of {len(bars)}", "our criterion")
@@ -290,13 +289,14 @@ def _notice(records: Sequence[Record]) -> str:
     lines = [f"{record.name} failed: {record.failure}" for record in records if record.failure]
     lines += [
         f"{record.name}: {finding.what}: {finding.ours}, bar {_bar_text(finding.bar)}"
-        for record, finding in _with_bar(records)
+        for record, finding in with_bar(records)
         if not finding.met
     ]
     return html.notice(lines) if lines else ""
 
 
-def _with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
+def with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
+    """Return the findings that have a criterion, with their records."""
     return [
         (record, finding)
         for record in records
@@ -312,12 +312,11 @@ def _bar_text(bar: str) -> str:
 
 def _picture(printed: PrintedFigure, folder: Path) -> tuple[str, str]:
     """Return a figure as a data URL, and the style with its width."""
-    stem = folder / FIGURES / printed.file
-    drawing = stem.with_name(f"{stem.name}.svg")
+    drawing, pixels = (folder / FIGURES / f"{printed.file}.{kind}" for kind in ("svg", "png"))
     width = f"max-width: {_PX_PER_INCH * printed.width_in:.0f}px"
     if drawing.stat().st_size <= _LARGEST_SVG:
         return html.data_url(drawing.read_bytes(), "svg+xml"), width
-    return html.data_url(stem.with_name(f"{stem.name}.png").read_bytes(), "png"), width
+    return html.data_url(pixels.read_bytes(), "png"), width
 
 
 def duration(seconds: float) -> str:

@@ -75,8 +75,7 @@ def _run_control(laboratory: Laboratory) -> ExperimentResult:  # noqa: ARG001
 
 def _trials(name: str) -> Trials:
     model = vehicle_model(name)
-    seed = 1
-    return Trials(model, load_gains(model.name), rendered=False, fps=25.0, seed=seed)
+    return Trials(model, load_gains(model.name), seed=1)
 
 
 def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[ExperimentRow, ...]:
@@ -286,13 +285,11 @@ def _postures(sensor: _PartlyRendered) -> tuple[FloatArray, FloatArray]:
 
     Range in metres, pitch and yaw in degrees.
     """
-    found, true = [], []
-    for _, posture, truth in sensor.seen:
-        if isinstance(posture, Posture):
-            found.append((posture.range, posture.pitch, posture.yaw))
-        else:
-            found.append((math.nan,) * 3)
-        true.append((truth.range, truth.pitch, truth.yaw))
+    found = [
+        (one.range, one.pitch, one.yaw) if isinstance(one, Posture) else (math.nan,) * 3
+        for _, one, _ in sensor.seen
+    ]
+    true = [truth[:3] for _, _, truth in sensor.seen]
     scale = np.array([1.0, 180.0 / math.pi, 180.0 / math.pi])
     return scale * np.array(found), scale * np.array(true)
 

@@ -39,8 +39,7 @@ from aqualvs.simulation.panels import PanelRenderer, RoomLight
 from aqualvs.yamlfile import write_text, yaml_text
 
 
-@dataclass(frozen=True, slots=True)
-class IndexSeries:
+class IndexSeries(NamedTuple):
     """Index and its uncertainty after each of F frames, shape (F,) each."""
 
     truth: FloatArray
@@ -52,8 +51,7 @@ class IndexSeries:
 
     def after(self, start: int, every: int = 1) -> "IndexSeries":
         """Return frame `start` and every `every`-th one after it."""
-        part = slice(start, None, every)
-        return IndexSeries(self.truth[part], self.ours[part], self.sigma[part], self.paper[part])
+        return IndexSeries(*(column[start::every] for column in self))
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +150,10 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
     Raises `CalibrationError` if the target is not detected.
     """
     rig = laboratory.rig
-    plate, markers = _plate(laboratory, rig)
+    plate = targets.plate_before(rig, _SETUP.plate_far)
+    path = laboratory.folder("index") / "target.yaml"
+    write_text(path, yaml_text(targets.target_mapping(plate)))
+    markers = load_target(path)
     truly = targets.moved(plate, _out_of_place(plate))
     media = (rig.n_air, *waters)
     rng = np.random.default_rng(_SETUP.seed)
@@ -168,14 +169,6 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
             noise = rng.normal(0.0, _SETUP.corner_px, found.pixels.shape)
             views.append(replace(found, name=f"frame_{len(views)}", pixels=found.pixels + noise))
     return Cruise(views, np.repeat(media, _SETUP.frames), picture)
-
-
-def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]:
-    """Return the plate at its nominal pose, and its markers from its file."""
-    plate = targets.plate_before(rig, _SETUP.plate_far)
-    path = laboratory.folder("index") / "target.yaml"
-    write_text(path, yaml_text(targets.target_mapping(plate)))
-    return plate, load_target(path)
 
 
 def _out_of_place(plate: targets.Marked) -> SE3:
@@ -194,19 +187,9 @@ def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
 
 
 def follow(rig: Rig, taken: Cruise) -> tuple[IndexSeries, list[IndexStep]]:
-    """Estimate the index frame by frame, by our and by the paper's method.
+    """Estimate the index frame by frame, by our and by the paper's method; return steps, too.
 
-    Parameters
-    ----------
-    rig : Rig
-        Calibrated rig with its covariance.
-    taken : Cruise
-        Frames, beginning in air.
-
-    Returns
-    -------
-    numbers : IndexSeries
-    alarms : list of IndexStep
+    `rig`: calibrated, with its covariance. `taken`: beginning in air.
     """
     estimator = IndexEstimator(
         rig, uncertainty=rig_uncertainty(rig), options=_OPTIONS, prior=IndexPrior.air(rig.n_air)
