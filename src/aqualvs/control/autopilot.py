@@ -44,10 +44,8 @@ class Decision:
     effort: Effort  # What may be sent; neutral unless engaged.
     # Why it is not what the controller asked for, or why that is no more than to stay.
     reason: LimitReason | None
-    # What the mission wanted.
-    guidance: Guidance
-    # Whether efforts pass; False until `NetPilot.engage`.
-    engaged: bool
+    guidance: Guidance  # What the mission wanted.
+    engaged: bool  # Whether efforts pass; False until `NetPilot.engage`.
 
 
 class NetPilot:

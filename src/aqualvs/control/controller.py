@@ -36,8 +36,7 @@ class PidOptions:
     # Limits of the output.
     low: float = -math.inf
     high: float = math.inf
-    # Greatest change of the output per second.
-    output_rate: float = math.inf
+    output_rate: float = math.inf  # Greatest change of the output per second.
     # Seconds between two updates beyond which nothing is integrated and the derivative starts anew.
     longest_step: float = 0.5
 

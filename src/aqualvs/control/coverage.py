@@ -65,10 +65,8 @@ class CoverageMap:
     # Shape (M + 1,): radians, or metres. Bearings go on beyond a full turn where that joins them;
     # those of more than a turn are folded into 0 to 2 pi.
     across_edges: FloatArray
-    # Shape (N, M): for how long each cell was in view; 0 is unseen.
-    seconds: FloatArray
-    # Shape (K, 3): time, place across and depth of the vehicle's foot on the net.
-    path: FloatArray
+    seconds: FloatArray  # Shape (N, M): for how long each cell was in view; 0 is unseen.
+    path: FloatArray  # Shape (K, 3): time, place across and depth of the vehicle's foot on the net.
 
 
 class Coverage:

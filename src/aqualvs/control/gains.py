@@ -34,12 +34,9 @@ class ThrustMap:
     forward: float
     backward: float
     right: float
-    # Effort below which nothing happens.
-    dead_band: float = 0.0
-    # Share of the curve that is straight.
-    linear: float = 1.0
-    # Of the level thrusters.
-    layout: Layout = Layout.VECTORED
+    dead_band: float = 0.0  # Effort below which nothing happens.
+    linear: float = 1.0  # Share of the curve that is straight.
+    layout: Layout = Layout.VECTORED  # Of the level thrusters.
 
     def __post_init__(self) -> None:
         """Raise `OptionError` if a thrust is not positive or a share none: no inverse exists."""
@@ -193,8 +190,7 @@ class VehicleFacts:
     # At effort 1, in rad/s and m/s.
     turning_rate: float
     climb_rate: float
-    # Distance of the dome's centre ahead of the vehicle's, in metres.
-    dome_forward: float = 0.0
+    dome_forward: float = 0.0  # Distance of the dome's centre ahead of the vehicle's, in metres.
 
     def __post_init__(self) -> None:
         """Raise `OptionError` if a number is not positive."""
@@ -222,15 +218,12 @@ class RangeGains:
     # Time from an effort until pictures show it, in seconds: so much later a setpoint's change is
     # expected to be seen.
     lag: float
-    # Asked for towards and away from the target, in m/s.
-    greatest_speed: float = 0.25
-    # With which a new setpoint is approached, in m/s and m/s².
-    ramp_speed: float = 0.15
+    greatest_speed: float = 0.25  # Asked for towards and away from the target, in m/s.
+    ramp_speed: float = 0.15  # With which a new setpoint is approached, in m/s and m/s².
     # In place of `ramp_speed` towards the target, where that is faster, in m/s: for vehicles that
     # coast far when the picture stands still and thrust ends.
     approach_speed: float = 0.15
-    # As `ramp_speed`.
-    ramp_acceleration: float = 0.12
+    ramp_acceleration: float = 0.12  # As `ramp_speed`.
     # Greatest change of the acceleration asked for, per second. What it holds back comes late: with
     # 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
     jerk: float = 30.0
@@ -259,19 +252,15 @@ class YawGains:
     proportional: float  # Turning rate by the yaw's error, in rad/s per rad.
     # Turning rate by error and second, in rad/s² per rad: what a curved target asks for.
     integral: float
-    # As of the range.
-    lag: float
-    # Turning rate by the yaw's rate; 0 or more.
-    derivative: float = 0.0
-    # Turning rate, in rad/s.
-    greatest_rate: float = math.radians(30.0)
+    lag: float  # As of the range.
+    derivative: float = 0.0  # Turning rate by the yaw's rate; 0 or more.
+    greatest_rate: float = math.radians(30.0)  # Turning rate, in rad/s.
     # With which a new setpoint is approached, in rad/s and rad/s².
     ramp_rate: float = math.radians(15.0)
     ramp_acceleration: float = math.radians(15.0)
     # Greatest change of the turning rate asked for, in rad/s².
     acceleration: float = math.radians(200.0)
-    # Turning rate below which no turn begins, in rad/s.
-    quiet_rate: float = math.radians(0.8)
+    quiet_rate: float = math.radians(0.8)  # Turning rate below which no turn begins, in rad/s.
 
     def __post_init__(self) -> None:
         """Raise `OptionError` naming the first gain that is negative, or 0 where it must not be."""

@@ -111,8 +111,7 @@ class SafetyLimits:
     heartbeat_age: float = 1.0
     # Metres to the target, from the dome's centre, within which nothing approaches.
     least_range: float = 0.35
-    # Greatest closing speed far from the target, in m/s.
-    approach_speed: float = 0.3
+    approach_speed: float = 0.3  # Greatest closing speed far from the target, in m/s.
     # Seconds to the least range, at the present closing speed, that must remain: the speed allowed
     # shrinks with the way that is left.
     stopping_time: float = 0.7

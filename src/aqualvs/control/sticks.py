@@ -65,10 +65,8 @@ class StickShaping:
     # Pilot gain (JS_GAIN_DEFAULT). Where trims are 1500 us it does not matter but for the rate of
     # climb.
     gain: float = 0.5
-    # JS_THR_GAIN.
-    throttle_gain: float = 1.0
-    # THR_DZ, in thousandths of the throttle's travel.
-    throttle_dead_zone: float = 100.0
+    throttle_gain: float = 1.0  # JS_THR_GAIN.
+    throttle_dead_zone: float = 100.0  # THR_DZ, in thousandths of the throttle's travel.
     # RC3 to RC6.
     throttle: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=30.0))
     yaw: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=40.0))

@@ -21,13 +21,11 @@ class FilteredPosture:
     range: float
     pitch: float
     yaw: float
-    # Shape (3,): their time derivatives, in m/s and rad/s.
-    rates: FloatArray
+    rates: FloatArray  # Shape (3,): their time derivatives, in m/s and rad/s.
     # Shape (6, 6): of (range, pitch, yaw) and the rates, by the noise of the frames and the unknown
     # motion.
     covariance: FloatArray
-    # Time since the last measurement that entered.
-    age_s: float
+    age_s: float  # Time since the last measurement that entered.
     # Whether this frame's measurement entered; False where it was refused by the gate, or there was
     # none.
     accepted: bool
@@ -54,8 +52,7 @@ class PostureFilterOptions:
     # Standard deviation of the rates when the filter starts, in m/s and rad/s.
     initial_speed: float = 0.5
     initial_turn_rate: float = 0.5
-    # Share of sound measurements that pass the gate.
-    gate_probability: float = 0.9999
+    gate_probability: float = 0.9999  # Share of sound measurements that pass the gate.
     # Rejected measurements in a row that agree with each other, after which the filter accepts
     # them: the target itself is elsewhere. An angle alone begins anew after so many.
     n_rejected: int = 3

@@ -156,8 +156,7 @@ class Loop:
     # Coefficients, highest power first.
     above: FloatArray
     below: FloatArray
-    # In seconds.
-    delay: float
+    delay: float  # In seconds.
 
     def at(self, omega: FloatArray) -> ComplexArray:
         """Return the response at frequencies in rad/s, shape (N,)."""
@@ -183,12 +182,9 @@ class Margins:
     stable: bool  # The others mean nothing where it is False.
     # Highest frequency at which the loop's gain is 1, in rad/s; NaN if there is none.
     crossover: float
-    # Least phase that may still be lost at such a frequency, in radians.
-    phase: float
-    # Factor by which the gain may grow.
-    gain: float
-    # That may be added, in seconds.
-    delay: float
+    phase: float  # Least phase that may still be lost at such a frequency, in radians.
+    gain: float  # Factor by which the gain may grow.
+    delay: float  # That may be added, in seconds.
     # Least distance of the loop from -1; 1 / modulus is the greatest amplification of a
     # disturbance.
     modulus: float
@@ -256,15 +252,12 @@ class TuneOptions:
     # By which mass and drag may be off, either way.
     mass_factor: float = 1.2
     drag_factor: float = 2.0
-    # Greatest speed of the water, in m/s.
-    current: float = 0.5
+    current: float = 0.5  # Greatest speed of the water, in m/s.
     # Least distance of the loop from -1 at the usual delay, in the worst corner, where mass, drag
     # and current are off at once.
     least_modulus: float = 0.35
-    # As much at the greatest delay.
-    least_late_modulus: float = 0.2
-    # Of the yaw at the greatest delay; it has less to fight.
-    least_yaw_modulus: float = 0.45
+    least_late_modulus: float = 0.2  # As much at the greatest delay.
+    least_yaw_modulus: float = 0.45  # Of the yaw at the greatest delay; it has less to fight.
 
     def __post_init__(self) -> None:
         """Raise `OptionError` naming the value that is impossible."""

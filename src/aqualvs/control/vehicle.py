@@ -128,8 +128,7 @@ class VehicleState:
     heading: float | None = None
     roll: float | None = None
     pitch: float | None = None
-    # Why it seems not to obey; empty if it does, or nothing is known.
-    doubt: str = ""
+    doubt: str = ""  # Why it seems not to obey; empty if it does, or nothing is known.
     # Other sender that speaks as the vehicle, and agrees with it; empty if there is none.
     rival: str = ""
 

@@ -49,8 +49,7 @@ class FrameAnswers:
     # Shape (N, 3): errors of range in percent of the true one, of pitch and yaw in degrees; NaN
     # without answer or target.
     error: FloatArray
-    # Shape (N, 3): standard deviations that the system states, same units.
-    sigma: FloatArray
+    sigma: FloatArray  # Shape (N, 3): standard deviations that the system states, same units.
 
     @property
     def measurable(self) -> BoolArray:

@@ -56,8 +56,7 @@ class DiveTruth:
     name: str
     level: str
     frames: IntArray  # Shape (N,): frame numbers, from 0.
-    # Shape (N, 3): range (m), pitch and yaw (deg); NaN without a target.
-    posture: FloatArray
+    posture: FloatArray  # Shape (N, 3): range (m), pitch and yaw (deg); NaN without a target.
     # Shape (N,): number of stripe points on the target that are visible in the picture.
     n_visible: IntArray
 

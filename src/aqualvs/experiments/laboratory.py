@@ -53,8 +53,7 @@ class RenderedDive:
     name: str
     # With `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the requested frames.
     folder: Path
-    # True rig.
-    rig: Rig
+    rig: Rig  # True rig.
 
     scenario: Scenario
 
@@ -74,8 +73,7 @@ class MeasuredDive:
     """Dive measured by one scanner, N frames, with the truth."""
 
     scans: list[Scan]
-    # Shape (N, 3): range in m, pitch and yaw in radians; NaN if unknown.
-    truth: FloatArray
+    truth: FloatArray  # Shape (N, 3): range in m, pitch and yaw in radians; NaN if unknown.
 
     @property
     def time_s(self) -> FloatArray:

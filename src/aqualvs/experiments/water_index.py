@@ -46,8 +46,7 @@ class IndexSeries(NamedTuple):
     # Joint estimate and its standard deviation.
     ours: FloatArray
     sigma: FloatArray
-    # The paper's method: each frame separately, with only the index free.
-    paper: FloatArray
+    paper: FloatArray  # The paper's method: each frame separately, with only the index free.
 
     def after(self, start: int, every: int = 1) -> "IndexSeries":
         """Return frame `start` and every `every`-th one after it."""
@@ -62,8 +61,7 @@ class Decentred:
     # Standard deviation of the index, for a target position known exactly, and to 0.2 mm and 0.1°.
     noise: FloatArray
     placed: FloatArray
-    # Whether the estimator calls the index observable in the latter case.
-    observable: BoolArray
+    observable: BoolArray  # Whether the estimator calls the index observable in the latter case.
 
 
 def _draw_numbers(figure: Figure, wet: IndexSeries, n_each: int) -> None:
@@ -116,8 +114,7 @@ class _Setup(NamedTuple):
     # Frames in each medium; a change is accepted at the fourth frame, as a fish may pass.
     frames: int = 10
     fps: float = 5.0
-    # Distance of the target, in metres.
-    plate_far: float = 0.35
+    plate_far: float = 0.35  # Distance of the target, in metres.
     # True pose of the target relative to its file: as far off as the options allow for.
     turn_deg: tuple[float, float, float] = (0.06, -0.11, 0.08)
     shift_mm: tuple[float, float, float] = (0.15, -0.22, 0.12)

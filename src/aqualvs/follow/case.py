@@ -40,14 +40,10 @@ class SimCase:
     # Posture at the start, at rest, in metres and radians.
     start_range: float = 0.6
     start_yaw: float = 0.0
-    # Of the frames.
-    timing: Timing = field(default_factory=Timing)
-    # Latency from sending an effort to its arrival at the vehicle, in seconds.
-    wire: float = 0.02
-    # Of the safety gate.
-    limits: SafetyLimits = field(default_factory=SafetyLimits)
-    # Random seed of the noise of the vehicle's sensors.
-    seed: int = 0
+    timing: Timing = field(default_factory=Timing)  # Of the frames.
+    wire: float = 0.02  # Latency from sending an effort to its arrival at the vehicle, in seconds.
+    limits: SafetyLimits = field(default_factory=SafetyLimits)  # Of the safety gate.
+    seed: int = 0  # Random seed of the noise of the vehicle's sensors.
 
     def loop(self, sensor: RangeSensor, mission: Mission) -> SimulatedLoop:
         """Return the loop, ready to run."""

@@ -201,12 +201,9 @@ class SimRequest:
     # Speed in m/s, and direction of flow, in radians clockwise from the direction of view.
     current: float = 0.3
     current_to: float = math.radians(60.0)
-    # Amplitude in metres.
-    waves: float = 0.1
-    # Radius of a round net seen from inside, in metres; 0 for a flat net.
-    cage_radius: float = 0.0
-    # Amplitude of the net's own motion, in metres.
-    net_sway: float = 0.0
+    waves: float = 0.1  # Amplitude in metres.
+    cage_radius: float = 0.0  # Radius of a round net seen from inside, in metres; 0 for a flat net.
+    net_sway: float = 0.0  # Amplitude of the net's own motion, in metres.
 
     seconds: float = 60.0
     fps: float = 25.0  # Frames a second.
@@ -220,10 +217,8 @@ class SimRequest:
     seed: int = 0
     # Time from which on the picture is frozen, in seconds; never if left out.
     freeze: float | None = None
-    # The pilot's page; with it, the run is in real time.
-    page: Page | None = None
-    # Whether to replace earlier output of this command in `out`.
-    overwrite: bool = False
+    page: Page | None = None  # The pilot's page; with it, the run is in real time.
+    overwrite: bool = False  # Whether to replace earlier output of this command in `out`.
 
     def __post_init__(self) -> None:
         """Raise `OptionError` naming the value if it cannot be simulated."""

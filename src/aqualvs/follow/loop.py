@@ -106,10 +106,8 @@ class _Sight:
     # Arrival of the last frame; last report of a silent stream.
     heard_s: float = 0.0
     reported_s: float = -math.inf
-    # Exposure of the last frame.
-    exposed_s: float = 0.0
-    # Arrival of the last valid posture.
-    seen_s: float = -math.inf
+    exposed_s: float = 0.0  # Exposure of the last frame.
+    seen_s: float = -math.inf  # Arrival of the last valid posture.
 
     def silence_s(self) -> float:
         """Return the time of the next report of a silent stream."""

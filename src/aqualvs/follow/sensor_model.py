@@ -147,8 +147,7 @@ class PostureNoise:
     # In radians.
     pitch: float = math.radians(0.4)
     yaw: float = math.radians(0.4)
-    # Share of frames with ten times that noise, unknown to the scanner.
-    outliers: float = 0.0
+    outliers: float = 0.0  # Share of frames with ten times that noise, unknown to the scanner.
 
 
 class SampledSensor:

@@ -101,36 +101,27 @@ class Development:
     # Radiance of a white surface in the light of the camera's own lamps, which is even over the
     # whole view and added to the daylight of the water.
     lamp: Vector = (0.0, 0.0, 0.0)
-    # Standard deviation of the blur of lens and pixels, in pixels.
-    defocus_px: float = 0.75
-    # Share of the light that the lens spreads over a halo.
-    flare: float = 0.02
-    # Standard deviation of that halo, in pixels.
-    flare_px: float = 12.0
-    # Mean grey (0 to 1, linear) that automatic exposure aims at.
-    exposure: float = 0.22
-    # Least and greatest gain of automatic exposure.
-    gains: tuple[float, float] = (0.25, 4.0)
+    defocus_px: float = 0.75  # Standard deviation of the blur of lens and pixels, in pixels.
+    flare: float = 0.02  # Share of the light that the lens spreads over a halo.
+    flare_px: float = 12.0  # Standard deviation of that halo, in pixels.
+    exposure: float = 0.22  # Mean grey (0 to 1, linear) that automatic exposure aims at.
+    gains: tuple[float, float] = (0.25, 4.0)  # Least and greatest gain of automatic exposure.
     # Drift of the overall gain and of the balance of red and of blue.
     exposure_drift: Drift = Drift()
     red_drift: Drift = Drift()
     blue_drift: Drift = Drift()
     # Strength of automatic white balance towards a grey mean of the picture, 0 to 1.
     white_balance: float = 0.6
-    # Standard deviation in the dark, of full scale at gain 1.
-    read_noise: float = 0.004
+    read_noise: float = 0.004  # Standard deviation in the dark, of full scale at gain 1.
     # Variance of the noise per unit of light, of full scale squared at gain 1.
     shot_noise: float = 1.5e-4
     # One colour a pixel (Bayer, red top left), the others interpolated between neighbours.
     mosaic: bool = True
-    # Grey level = light**(1 / gamma), before `contrast`.
-    gamma: float = 2.0
+    gamma: float = 2.0  # Grey level = light**(1 / gamma), before `contrast`.
     # Strength of an S curve over that, 0 to 1: darker shadows, lights that reach white earlier.
     contrast: float = 0.0
-    # Grey level of no light, of full scale.
-    black: float = 0.0
-    # Strength of the unsharp mask on luma.
-    sharpening: float = 0.0
+    black: float = 0.0  # Grey level of no light, of full scale.
+    sharpening: float = 0.0  # Strength of the unsharp mask on luma.
     # Its standard deviations along x and y, in pixels; 0 leaves a direction alone.
     sharpening_px: tuple[float, float] = (1.0, 1.0)
     # Blur of chroma along x and y, in pixels: noise reduction, or bandwidth.

@@ -130,8 +130,7 @@ class LaserSource:
     direction: FloatArray
     # Half the fan's opening in radians (in air, behind a window).
     half_angle: float = float(np.deg2rad(34.0))
-    # Standard deviation of the sheet's thickness at the source, in metres.
-    sigma: float = 0.45e-3
+    sigma: float = 0.45e-3  # Standard deviation of the sheet's thickness at the source, in metres.
     # Growth of that standard deviation with distance (in the water), in radians.
     divergence: float = 0.75e-3
     # Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the source,
@@ -150,8 +149,7 @@ class Sheets(NamedTuple):
     # Shape (n, N_FAN): distance from the source at which the sheet's middle meets a surface;
     # infinite where none.
     first: FloatArray
-    # Shape (n, COLUMNS): the sheets for the kernels of `aqualvs.optics.sheet`.
-    optics: FloatArray
+    optics: FloatArray  # Shape (n, COLUMNS): the sheets for the kernels of `aqualvs.optics.sheet`.
     # Shape (n, 2): greatest distance of a bent sheet from the plane near it: metres at the window,
     # and metres for every metre from the source.
     stray: FloatArray
@@ -247,8 +245,7 @@ class FanRays(NamedTuple):
     # directions.
     origins: FloatArray
     directions: FloatArray
-    # Shape (N_FAN,): length of the light's way from the source to there.
-    way: FloatArray
+    way: FloatArray  # Shape (N_FAN,): length of the light's way from the source to there.
 
 
 def fan_rays(rig: Rig, sheets: Sheets, i: int) -> FanRays:

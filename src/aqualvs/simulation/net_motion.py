@@ -53,8 +53,7 @@ class NetWall:
     sway: float = 0.0
     sway_period: float = 6.0
     sway_phase: float = 0.0
-    # Steady speed along `bearing`, in m/s.
-    drift: float = 0.0
+    drift: float = 0.0  # Steady speed along `bearing`, in m/s.
     # In radians about the horizontal through the middle; positive where the far normal points up,
     # as pitch.
     tilt: float = 0.0

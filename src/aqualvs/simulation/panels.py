@@ -248,8 +248,7 @@ class Panel:
     # Of the frame with x to the right, y down, z into the panel and its origin at the outer corner
     # of the top-left cell.
     dome_from_panel: SE3
-    # The print; from behind it is seen mirrored.
-    texture: Texture
+    texture: Texture  # The print; from behind it is seen mirrored.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -260,10 +259,8 @@ class RoomLight:
     lamp: Vector = (0.5, -0.6, 0.9)  # The lamp's place in `dome`, in metres.
     # Share of the light that falls off with the angle to the lamp, 0 to 1.
     lamp_share: float = 0.45
-    # Red, green and blue of white.
-    tint: Vector = (1.0, 0.98, 0.93)
-    # Radiance that the water adds everywhere.
-    veil: Vector = (0.0, 0.0, 0.0)
+    tint: Vector = (1.0, 0.98, 0.93)  # Red, green and blue of white.
+    veil: Vector = (0.0, 0.0, 0.0)  # Radiance that the water adds everywhere.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -196,12 +196,10 @@ class Renderer:
     rig: Rig  # Camera, housing, water and lasers.
     # One for each laser; by default they follow from the rig (`default_sources`).
     sources: Sequence[LaserSource] = ()
-    # Rays along each side of a pixel: 2 means four rays a pixel.
-    samples: int = 2
+    samples: int = 2  # Rays along each side of a pixel: 2 means four rays a pixel.
     # Number of bands of rows rendered in parallel; the picture does not depend on it.
     threads: int = 1
-    # Sensor and processing; the rig has the place of the lens.
-    camera: SimulatedCamera = IDEAL
+    camera: SimulatedCamera = IDEAL  # Sensor and processing; the rig has the place of the lens.
 
     _corners: CornerRays = field(init=False, repr=False)
     _beams: Beams = field(init=False, repr=False)

@@ -128,10 +128,8 @@ class Course:
     # Smooth passes through the values without overshoot; steps holds each of them for its share of
     # the dive.
     mode: Literal["smooth", "steps"] = "smooth"
-    # Amplitude of a sine on top.
-    sway: float = 0.0
-    # Of that sine, in seconds.
-    period: float = 4.0
+    sway: float = 0.0  # Amplitude of a sine on top.
+    period: float = 4.0  # Of that sine, in seconds.
 
     def at(self, t: float, duration: float) -> float:
         """Return the value at time `t` of a dive of `duration` seconds."""
@@ -196,8 +194,7 @@ class Scenario:
     water: WaterOptics = field(default_factory=WaterOptics)
     sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True
-    # Of the camera, in the words of `--shutter`; None leaves the rig's.
-    shutter: str | None = None
+    shutter: str | None = None  # Of the camera, in the words of `--shutter`; None leaves the rig's.
 
     @property
     def n_frames(self) -> int:

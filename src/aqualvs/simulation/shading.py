@@ -39,8 +39,7 @@ class Light(NamedTuple):
     sheet_scatter: float
     caustics: float
     glare: float
-    # Moves the caustics, in seconds.
-    time: float
+    time: float  # Moves the caustics, in seconds.
 
 
 def pack_light(scene: Scene, t: float) -> Light:

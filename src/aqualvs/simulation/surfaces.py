@@ -41,15 +41,11 @@ class Surfaces(NamedTuple):
     holes: FloatArray  # Shape (n, 4): index of the net, u, v and radius.
     # Shape (n, columns): see `net.pack_fold`; the first column is the index of the net.
     folds: FloatArray
-    # As `walls`.
-    ellipsoids: FloatArray
+    ellipsoids: FloatArray  # As `walls`.
     all_ellipsoids: IntArray  # Shape (n,): all of their rows.
-    # As `walls`.
-    boxes: FloatArray
-    # As `walls`.
-    bubbles: FloatArray
-    # Noise for textures.
-    tiles: Tiles
+    boxes: FloatArray  # As `walls`.
+    bubbles: FloatArray  # As `walls`.
+    tiles: Tiles  # Noise for textures.
 
 
 class Hit(NamedTuple):

@@ -32,8 +32,7 @@ class Tiles(NamedTuple):
     smooth: NDArray[np.float32]
     # Shape (512, 512): bright network on dark ground, mean 1: light focused by waves.
     ridges: NDArray[np.float32]
-    # Shape (256, 256): independent uniform values.
-    white: NDArray[np.float32]
+    white: NDArray[np.float32]  # Shape (256, 256): independent uniform values.
 
 
 @cache
@@ -116,8 +115,7 @@ class CharucoPrint:
     square: float
     marker: float
     border: float
-    # OpenCV's name of the markers' dictionary.
-    dictionary: str
+    dictionary: str  # OpenCV's name of the markers' dictionary.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,10 +126,8 @@ class MarkerPrint:
     ids: IntArray  # Shape (M,): number of each in the dictionary.
     # Shape (M, 2): column and row of each one's top-left corner, in cells.
     corners: IntArray = field(repr=False)
-    # Cells along a marker's side; a multiple of its bits and its frame together.
-    side: int
-    # Cells of white paper around each.
-    ring: int
+    side: int  # Cells along a marker's side; a multiple of its bits and its frame together.
+    ring: int  # Cells of white paper around each.
 
 
 def charuco_texture(board: CharucoPrint) -> Texture:

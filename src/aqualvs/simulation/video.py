@@ -33,10 +33,8 @@ class Compression:
     codec: Codec = "h264"
     # Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
     crf: int = 20
-    # Bits a second of "h264".
-    bit_rate: int | None = None
-    # Of "mjpeg", 1 to 100; larger is better.
-    jpeg_quality: int = 80
+    bit_rate: int | None = None  # Bits a second of "h264".
+    jpeg_quality: int = 80  # Of "mjpeg", 1 to 100; larger is better.
 
     def __post_init__(self) -> None:
         if self.codec not in {"h264", "lossless", "mjpeg"}:

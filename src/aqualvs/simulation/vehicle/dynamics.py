@@ -41,10 +41,8 @@ class Body(NamedTuple):
     # Shape (5, 6): rigid and added inertia, linear and quadratic drag; weight, buoyancy, centre of
     # buoyancy, displaced mass.
     hull: FloatArray
-    # Shape (6, n): force and moment of every thruster's unit thrust.
-    allocation: FloatArray
-    # Time constant of the thrusters, in seconds.
-    lag: float
+    allocation: FloatArray  # Shape (6, n): force and moment of every thruster's unit thrust.
+    lag: float  # Time constant of the thrusters, in seconds.
 
 
 class Work(NamedTuple):

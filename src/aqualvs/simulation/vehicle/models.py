@@ -47,8 +47,7 @@ class ThrustCurve:
     # (Blue Robotics' chart; 5.25 and 4.10 kgf at 16 V).
     forward: float = 44.3
     reverse: float = 34.5
-    # Share of the command's travel without thrust. 0.07 is 28 of 400 µs.
-    dead_band: float = 0.07
+    dead_band: float = 0.07  # Share of the command's travel without thrust. 0.07 is 28 of 400 µs.
     # 0.6 follows the same chart at 12 V within 3 % of the greatest thrust, both ways.
     linear: float = 0.6
     # Time constant in seconds; 0.1 is a round number for a small propeller, not measured.
@@ -69,10 +68,8 @@ class StickInput:
     # Greatest, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of these vehicles
     # reaches; 0.5 is a pilot's choice.
     climb_rate: float = 0.5
-    # RC4_DZ, in microseconds; shrinks with the gain, as the next one.
-    yaw_dead_zone: int = 40
-    # THR_DZ, in thousandths of the throttle's travel.
-    throttle_dead_zone: int = 100
+    yaw_dead_zone: int = 40  # RC4_DZ, in microseconds; shrinks with the gain, as the next one.
+    throttle_dead_zone: int = 100  # THR_DZ, in thousandths of the throttle's travel.
     # RC4_TRIM (yaw), RC5_TRIM (forward) and RC6_TRIM (right), in microseconds.
     trims: tuple[int, int, int] = (1500, 1500, 1500)
 
@@ -144,15 +141,12 @@ class Autopilot:
     # Of roll, pitch, yaw: motor input per rad/s, and per rad/s and second.
     rate: Vec = (0.135, 0.135, 0.18)
     rate_integral: Vec = (0.09, 0.09, 0.018)
-    # Requested climb rate per error of the depth, in m/s per metre.
-    depth: float = 1.0
+    depth: float = 1.0  # Requested climb rate per error of the depth, in m/s per metre.
     # Motor input per m/s, and per m/s and second.
     climb: float = 1.5
     climb_integral: float = 0.75
-    # Time constant of requested turning rates, in seconds (ATC_INPUT_TC).
-    input_time: float = 0.15
-    # Acceleration to requested climb rates, in m/s² (PILOT_ACCEL_Z).
-    acceleration: float = 1.0
+    input_time: float = 0.15  # Time constant of requested turning rates, in seconds (ATC_INPUT_TC).
+    acceleration: float = 1.0  # Acceleration to requested climb rates, in m/s² (PILOT_ACCEL_Z).
     # Time after the last requested turn during which the held heading follows the present one, in
     # seconds (ArduSub's mode_althold.cpp).
     settle: float = 0.25
@@ -171,18 +165,12 @@ class VehicleModel:
     added_mass: Six
     linear_drag: Six
     quadratic_drag: Six
-    # Any number; all with the same curve.
-    thrusters: Sequence[Thruster]
-    # Of every thruster.
-    curve: ThrustCurve = field(default_factory=ThrustCurve)
-    # Response to the sticks.
-    sticks: StickInput = field(default_factory=StickInput)
-    # Gains of the vehicle's own loops.
-    autopilot: Autopilot = field(default_factory=Autopilot)
-    # Centre of the camera's dome in body axes, in metres.
-    dome_position: Vec = (0.20, 0.0, 0.0)
-    # Half length, width and height of the hull, in metres.
-    half_size: Vec = (0.2286, 0.169, 0.127)
+    thrusters: Sequence[Thruster]  # Any number; all with the same curve.
+    curve: ThrustCurve = field(default_factory=ThrustCurve)  # Of every thruster.
+    sticks: StickInput = field(default_factory=StickInput)  # Response to the sticks.
+    autopilot: Autopilot = field(default_factory=Autopilot)  # Gains of the vehicle's own loops.
+    dome_position: Vec = (0.20, 0.0, 0.0)  # Centre of the camera's dome in body axes, in metres.
+    half_size: Vec = (0.2286, 0.169, 0.127)  # Half length, width and height of the hull, in metres.
 
     @property
     def weight(self) -> float:

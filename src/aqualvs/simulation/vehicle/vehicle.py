@@ -44,8 +44,7 @@ class SensorErrors:
     # Standard deviation and correlation time in seconds of a slow error (first-order Gauss-Markov).
     wander: float = 0.0
     wander_time: float = 30.0
-    # Readings a second.
-    rate: float = 10.0
+    rate: float = 10.0  # Readings a second.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
