@@ -257,8 +257,7 @@ def _slope(steps: Sequence[float], percent: FloatArray) -> float:
 def _draw_beliefs(figure: Figure, index: FloatArray, lens: FloatArray) -> None:
     left, right = figure.subplots(1, 2)
     left.plot(_INDEX_STEPS, index, ".-", color=BLUE)
-    left.set_xlabel("error of the assumed index")
-    left.set_ylabel("error of the range (%)")
+    left.set(xlabel="error of the assumed index", ylabel="error of the range (%)")
     for row, name, colour in zip(lens, _AXES, _COLOURS, strict=True):
         right.plot(_LENS_STEPS_MM, row, ".-", color=colour, label=name)
     right.set_xlabel("error of the assumed lens position (mm)")

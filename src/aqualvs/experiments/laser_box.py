@@ -276,8 +276,7 @@ def _draw_errors(axes: Axes, names: Sequence[str], table: FloatArray, title: str
     )
     axes.plot(place + 0.12, table[:, 2], "x", color=PAPER, label="the paper's way")
     axes.set_xticks(place, names)
-    axes.set_xlim(-0.6, len(names) - 0.4)
-    axes.set_ylabel(title)
+    axes.set(xlim=(-0.6, len(names) - 0.4), ylabel=title)
     axes.grid(axis="x", visible=False)
 
 

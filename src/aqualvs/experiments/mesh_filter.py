@@ -413,8 +413,7 @@ def _draw_filtered(figure: Figure, papers: FilteredPeaks, scan: Scan, rig: Rig, 
         kept = xy[net]
         axes.plot(*kept.T, ".", color=OURS, markersize=2.0, label=f"net ({len(kept)})")
         axes.set_title(name, loc="left")
-        axes.set_xlabel("x in the laser's plane (mm)")
-        axes.set_aspect("equal")
+        axes.set(xlabel="x in the laser's plane (mm)", aspect="equal")
         axes.legend(loc="upper left", markerscale=3.0)
         axes.margins(x=0.06, y=0.5)
     figure.axes[0].set_ylabel("y, forward (mm)")

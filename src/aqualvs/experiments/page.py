@@ -24,8 +24,6 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -157,21 +155,13 @@ def work_folder(folder: Path) -> Path:
 def sources_digest() -> str:
     """Return a digest of the package's sources, which identifies the version."""
     digest = hashlib.sha256(__version__.encode())
-    for name, source in sorted(_sources(files("aqualvs"), ""), key=lambda one: one[0]):
+    package = Path(__file__).parents[1]
+    sources = [path for path in package.rglob("*") if path.suffix in (".py", ".yaml")]
+    names = {f"/{path.relative_to(package).as_posix()}": path for path in sources}
+    for name, path in sorted(names.items()):
         digest.update(name.encode())
-        digest.update(source.read_bytes())
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def _sources(folder: Traversable, above: str) -> list[tuple[str, Traversable]]:
-    found = []
-    for entry in folder.iterdir():
-        name = f"{above}/{entry.name}"
-        if entry.is_dir():
-            found.extend(_sources(entry, name))
-        elif name.endswith((".py", ".yaml")):
-            found.append((name, entry))
-    return found
 
 
 def _record(content: Mapping[str, Any]) -> Record:

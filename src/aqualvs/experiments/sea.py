@@ -317,8 +317,7 @@ def _draw(figure: Figure, log: LoopLog, seen_s: FloatArray, measured: FloatArray
     angles.plot(time_s, np.degrees(log.column("yaw")), color=DARK, alpha=0.5, label="true yaw")
     angles.plot(seen_s, measured[:, 2], ".", color=BLUE, label="measured yaw")
     angles.axhline(0.0, color=GREY, linewidth=0.6)
-    angles.set_ylabel("angle (degrees)")
-    angles.set_xlabel("time (s)")
+    angles.set(ylabel="angle (degrees)", xlabel="time (s)")
     angles.legend(loc="upper right", ncols=3)
     for axes in (ranges, angles):
         low, high = axes.get_ylim()

@@ -132,9 +132,8 @@ def _draw_angle(figure: Figure, measured: MeasuredDive, name: str) -> None:
     low.axhline(0.0, color=GREY, linewidth=0.7)
     bars = 2.0 * np.degrees(measured.sigmas[:, column])
     draw_dots(low, measured.time_s, _errors_deg(measured, name), bars, OURS)
-    low.set_ylim(-_SWING.bar_deg, _SWING.bar_deg)
-    low.set_ylabel("error (degrees)")
-    low.set_xlabel("time (s)")
+    bar = _SWING.bar_deg
+    low.set(ylim=(-bar, bar), ylabel="error (degrees)", xlabel="time (s)")
     figure.align_ylabels((top, low))
 
 
@@ -253,9 +252,7 @@ def _draw_distance(figure: Figure, calibrated: MeasuredDive, true: MeasuredDive)
     right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     for axes in (left, right):
         axes.axhline(0.0, color=DARK, linewidth=0.7)
-        axes.set_xticks(PLACES_MM)
-        axes.set_xlim(345, 688)
-        axes.set_xlabel("true distance (mm)")
+        axes.set(xticks=PLACES_MM, xlim=(345, 688), xlabel="true distance (mm)")
     left.set_ylabel("error of the distance (%)")
 
 

@@ -95,8 +95,7 @@ def _command(axes: "Axes", time_s: FloatArray, effort: FloatArray, name: str) ->
     axes.axhline(0.0, color=GREY, linewidth=0.6)
     axes.plot(time_s, effort, color=DARK, linewidth=0.7)
     most = max(0.2, 1.15 * float(np.abs(effort).max()))
-    axes.set_ylim(-most, most)
-    axes.set_ylabel(name)
+    axes.set(ylim=(-most, most), ylabel=name)
 
 
 def _panels(n: int, height_in: float) -> "tuple[Figure, list[Axes]]":

@@ -185,7 +185,7 @@ def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: 
         if reach < t:
             t, kind, index = reach, WALL, i
     for i in range(s.nets.shape[0]):
-        strand = meet_net(o, d, s.nets, i, s.holes, s.folds, s.tiles)
+        strand = meet_net(o, d, s, i)
         if strand.t < t:
             t, kind, index, normal, met = strand.t, NET, i, strand.normal, strand
     for i in range(s.boxes.shape[0]):
