@@ -110,31 +110,18 @@ def _thrust_map(model: VehicleModel) -> ThrustMap:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Turning:
-    """Lag of a vehicle's own autopilot behind a turning rate, in seconds.
+def turning_lag(model: VehicleModel, slower: float = 1.0) -> float:
+    """Return how late a model's autopilot follows a turning rate, in seconds.
 
-    The shaping of the stick, the thrusters' lag, and the rate loop: inertia over the moment that it
-    gives for a rate.
+    By the shaping of the stick, the thrusters' lag, and the rate loop, which may be slower by a
+    factor: inertia over the moment that it gives for a rate.
     """
-
-    shaping: float
-    thrusters: float
-    rate_loop: float
-
-    def lag(self, slower: float = 1.0) -> float:
-        """Return the total lag, with a rate loop that is slower by a factor."""
-        return self.shaping + self.thrusters + slower * self.rate_loop
-
-
-def turning_of(model: VehicleModel) -> Turning:
-    """Return how late a model's autopilot follows a turning rate."""
     curve = model.curve
     lever = float(np.abs(model.allocation()[5] @ model.mixing()[:, YAW]))
     each = 0.5 * (curve.forward + curve.reverse) * curve.linear / (1.0 - curve.dead_band)
     inertia = model.inertia[2] + model.added_mass[5]
     rate_loop = inertia / (model.autopilot.rate[2] * lever * each)
-    return Turning(model.autopilot.input_time, curve.lag, rate_loop)
+    return model.autopilot.input_time + curve.lag + slower * rate_loop
 
 
 def tidy(value: float) -> float:
@@ -302,14 +289,14 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     """
     options = options or TuneOptions()
     facts = facts_of(model)
-    lag, turn = model.curve.lag, turning_of(model)
+    lag, turn_lag = model.curve.lag, turning_lag(model)
     usual = options.delay + 0.5 * options.frame
 
     def of_range(k: float) -> RangeGains:
         return _range_gains(k, lag + usual, facts)
 
     def of_yaw(k: float) -> YawGains:
-        return _yaw_gains(k, turn.lag() + usual)
+        return _yaw_gains(k, turn_lag + usual)
 
     m, d = options.mass_factor, options.drag_factor
     corners = [*itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))]
@@ -330,7 +317,7 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     k1 = _greatest(model.name, range_is_enough)
     kp = _greatest(
         model.name,
-        lambda k: _enough(_yaw_worst(turn, of_yaw(k), options), options.least_yaw_modulus),
+        lambda k: _enough(_yaw_worst(model, of_yaw(k), options), options.least_yaw_modulus),
     )
     gains = ControlGains(vehicle=facts, range=of_range(k1), yaw=of_yaw(kp))
     return Tuned(
@@ -338,8 +325,8 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
         margins(_range_loop(facts, lag, gains.range, usual, 0.0)),
         range_worst(gains.range, options.delay),
         range_worst(gains.range, options.greatest_delay),
-        margins(_yaw_loop(turn.lag(), gains.yaw, usual)),
-        _yaw_worst(turn, gains.yaw, options),
+        margins(_yaw_loop(turn_lag, gains.yaw, usual)),
+        _yaw_worst(model, gains.yaw, options),
     )
 
 
@@ -441,11 +428,11 @@ def _yaw_loop(lag: float, gains: YawGains, delay: float) -> Loop:
     return Loop(above, np.array([lag, 1.0, 0.0, 0.0]), delay)
 
 
-def _yaw_worst(turning: Turning, gains: YawGains, options: TuneOptions) -> Margins:
+def _yaw_worst(model: VehicleModel, gains: YawGains, options: TuneOptions) -> Margins:
     # Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
     sluggish = 4.0
     delay = options.greatest_delay + 0.5 * options.frame
-    lags = (turning.lag(slower) for slower in (1.0, sluggish))
+    lags = (turning_lag(model, slower) for slower in (1.0, sluggish))
     return worst(margins(_yaw_loop(lag, gains, delay)) for lag in lags)
 
 

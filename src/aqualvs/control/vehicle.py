@@ -48,23 +48,19 @@ class SetpointHolder:
 
         Raises `OptionError` if it cannot be held; the one in force stays.
         """
-        if setpoint is not None:
-            self._check(setpoint)
-        with self._lock:
-            self._setpoint = setpoint
-
-    def _check(self, setpoint: Setpoint) -> None:
         near, far = self.working_range
-        if not near <= setpoint.range <= far:
+        if setpoint is not None and not near <= setpoint.range <= far:
             raise OptionError(
                 f"setpoint: range {setpoint.range:g} m is outside the working range; "
                 f"choose {near:.2f} to {far:.2f} m"
             )
-        if not abs(setpoint.yaw) <= self.MAX_YAW:
+        if setpoint is not None and not abs(setpoint.yaw) <= self.MAX_YAW:
             raise OptionError(
                 f"setpoint: yaw {math.degrees(setpoint.yaw):g} deg; choose at most "
                 f"{math.degrees(self.MAX_YAW):.0f} deg to either side"
             )
+        with self._lock:
+            self._setpoint = setpoint
 
 
 def clipped(value: float, most: float = 1.0) -> float:

@@ -24,10 +24,10 @@ from aqualvs.experiments.tank import wall_dive
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.rig import Laser, Rig, Window
+from aqualvs.optics.rig import Rig, Window
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE
-from aqualvs.simulation.lasers import LaserSource, default_sources
+from aqualvs.simulation.lasers import default_sources
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import Compression
 
@@ -115,21 +115,15 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _behind_windows(rig: Rig) -> Rig:
-    sources = default_sources(rig)
-    lasers = tuple(
-        _behind_window(laser, source, np.deg2rad(tilt))
-        for laser, source, tilt in zip(rig.lasers, sources, _TILTS_DEG, strict=True)
-    )
-    return replace(rig, name="windows", lasers=lasers)
-
-
-def _behind_window(laser: Laser, source: LaserSource, tilt: float) -> Laser:
-    normal = source.direction + np.tan(tilt) * laser.plane.normal
-    normal /= np.linalg.norm(normal)
-    # Distance of the window from the source, in metres.
+    # Distance of a window from its source, in metres.
     distance = 0.02
-    face = Plane(normal, float(normal @ source.position) + distance)
-    return replace(laser, window=Window(face, source.position))
+    lasers = []
+    for laser, source, tilt in zip(rig.lasers, default_sources(rig), _TILTS_DEG, strict=True):
+        normal = source.direction + np.tan(np.deg2rad(tilt)) * laser.plane.normal
+        normal /= np.linalg.norm(normal)
+        face = Plane(normal, float(normal @ source.position) + distance)
+        lasers.append(replace(laser, window=Window(face, source.position)))
+    return replace(rig, name="windows", lasers=tuple(lasers))
 
 
 def _with_best_planes(rig: Rig) -> Rig:

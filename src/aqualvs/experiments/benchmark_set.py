@@ -93,7 +93,9 @@ def load_set(folder: Path) -> BenchmarkSet:
     Raises `SourceError` if the folder contains no set, or a file of it cannot be read.
     """
     path = folder / SET_FILE
-    content = _read_yaml(path)
+    content = read_yaml(path, "a set that 'aqualvs benchmark -o DIR' wrote", SourceError)
+    if not isinstance(content, dict) or content.get(_VERSION_KEY) != 1:
+        raise SourceError(f"{path}: not a benchmark set of version 1; make the set again")
     try:
         name, checksum = str(content["name"]), str(content["checksum"])
         whole = bool(content["whole"])
@@ -166,13 +168,6 @@ def cell(path: Path, i_row: int, row: dict[str, str | None], column: str) -> flo
         raise SourceError(
             f"{path}: line {i_row + 2}: {column} is {text!r}; write a number or leave it empty"
         ) from None
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    content = read_yaml(path, "a set that 'aqualvs benchmark -o DIR' wrote", SourceError)
-    if not isinstance(content, dict) or content.get(_VERSION_KEY) != 1:
-        raise SourceError(f"{path}: not a benchmark set of version 1; make the set again")
-    return content
 
 
 _README_MD = "README.md"
@@ -260,7 +255,7 @@ def set_facts(dives: Sequence[BenchmarkDive]) -> dict[str, Any]:
     whole = len(dives) == len(benchmark_dives())
     whole &= all(dive.scenario.n_frames == N_FRAMES for dive in dives)
     return {
-        "aqualvs_benchmark": 1,
+        _VERSION_KEY: 1,
         "name": BENCHMARK_NAME,
         "checksum": benchmark_checksum(),
         "whole": whole,

@@ -361,9 +361,8 @@ def calibration_pictures(laboratory: Laboratory) -> CalibrationFiles:
         }
         (folder / _RIG_READY).write_text(json.dumps(stored), encoding="utf-8")
     known: dict[str, Any] = json.loads((folder / _RIG_READY).read_text(encoding="utf-8"))
-    return CalibrationFiles(
-        **{key: folder / one if isinstance(one, str) else one for key, one in known.items()}
-    )
+    paths = {key: folder / one for key, one in known.items() if isinstance(one, str)}
+    return CalibrationFiles(**known | paths)
 
 
 def calibrated_rig(laboratory: Laboratory) -> Rig:

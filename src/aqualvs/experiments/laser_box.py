@@ -117,20 +117,16 @@ def remaining(truth: Rig, found: Rig, ranges: Sequence[float] = _SETUP.ranges) -
     return Remaining(far, read - true, np.array([one.sigma_calibration for one in expected]))
 
 
-def _solve(laboratory: Laboratory) -> LasersResult:
+def _run(laboratory: Laboratory) -> ExperimentResult:
+    truth = laboratory.rig
     files = calibration_pictures(laboratory)
-    return calibrate_lasers(
+    solved = calibrate_lasers(
         picture_paths([files.box]),
         rig_without_lasers(laboratory),
         box=files.box_file,
         medium="air",
-        n_lasers=len(laboratory.rig.lasers),
+        n_lasers=len(truth.lasers),
     )
-
-
-def _run(laboratory: Laboratory) -> ExperimentResult:
-    truth = laboratory.rig
-    solved = _solve(laboratory)
     figures = matched(solved.solution.lasers, truth.lasers)
     errors = [plane_error(f, laser.plane) for f, laser in zip(figures, truth.lasers, strict=True)]
     lasers = tuple(one.laser for one in figures)

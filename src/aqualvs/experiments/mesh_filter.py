@@ -330,7 +330,18 @@ def _pictures(
     frame: Frame, scan: Scan, papers: FilteredPeaks, rig: Rig
 ) -> tuple[ExperimentFigure, ...]:
     laser = level_laser(rig)
-    reflections = _reflections(papers, scan, rig, laser)
+    mine = papers.laser == laser
+    reflections = Reflections(
+        frame=scan.index,
+        laser=rig.lasers[laser].name,
+        in_laser=_in_laser(papers.points_in_dome[mine], rig, laser),
+        offset=rig.lasers[laser].plane.offset,
+        working_range=rig.working_range,
+        usable=_in_range(papers.points_in_dome[mine], rig),
+        adaptive=np.zeros(int(mine.sum()), np.bool_),
+        paper=papers.on_mesh[mine],
+        every_pixel=True,
+    )
     planes = draw_figures(reflections, MeshFilterOptions())
     return (
         drawn(
@@ -357,21 +368,6 @@ def _pictures(
             "9.",
             figure=planes["laser_plane_image"],
         ),
-    )
-
-
-def _reflections(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> Reflections:
-    mine = papers.laser == laser
-    return Reflections(
-        frame=scan.index,
-        laser=rig.lasers[laser].name,
-        in_laser=_in_laser(papers.points_in_dome[mine], rig, laser),
-        offset=rig.lasers[laser].plane.offset,
-        working_range=rig.working_range,
-        usable=_in_range(papers.points_in_dome[mine], rig),
-        adaptive=np.zeros(int(mine.sum()), np.bool_),
-        paper=papers.on_mesh[mine],
-        every_pixel=True,
     )
 
 

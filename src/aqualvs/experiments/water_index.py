@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.targets.target_files import load_target
-from aqualvs.calibration.targets.targets import MarkerSet, View
+from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration.water_index.estimator import IndexEstimator, calibrate_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior, IndexStep
 from aqualvs.errors import CalibrationError
@@ -161,7 +161,10 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
             targets.plate_scene(truly, i, _ROOM), rng
         )
         laboratory.rendered(i, len(media))
-        found = _found(picture, markers, f"picture_{i}")
+        grey = np.asarray(np.rint(picture @ LUMA), np.uint8)
+        found = detect_markers(grey, markers, f"picture_{i}")
+        if isinstance(found, str):
+            raise CalibrationError(f"picture_{i}: {found}")
         for _ in range(_SETUP.frames):
             noise = rng.normal(0.0, _SETUP.corner_px, found.pixels.shape)
             views.append(replace(found, name=f"frame_{len(views)}", pixels=found.pixels + noise))
@@ -173,14 +176,6 @@ def _out_of_place(plate: targets.Marked) -> SE3:
     middle = plate.corners().reshape(-1, 3).mean(axis=0)
     rotation = rotation_from_rotvec(np.deg2rad(_SETUP.turn_deg))
     return SE3(rotation, middle - rotation @ middle + 1e-3 * np.array(_SETUP.shift_mm))
-
-
-def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
-    grey = np.asarray(np.rint(picture @ LUMA), np.uint8)
-    view = detect_markers(grey, markers, name)
-    if isinstance(view, str):
-        raise CalibrationError(f"{name}: {view}")
-    return view
 
 
 def follow(rig: Rig, taken: Cruise) -> tuple[IndexSeries, list[IndexStep]]:

@@ -6,7 +6,6 @@ no display.
 """
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -223,13 +222,6 @@ def write_report(log: LoopLog, setup: str, out: Path) -> Path:
     """
     with writing(out):
         figures = save_figures(drawn_follow_figures(log), out, dpi=160)
-    path = out / PAGE
-    with writing(path):
-        replace_text(path, _page(log, setup, figures))
-    return path
-
-
-def _page(log: LoopLog, setup: str, figures: Sequence[Path]) -> str:
     cards, warnings = _headline(log)
     content = {
         "title": "Hold and follow, simulated",
@@ -241,7 +233,10 @@ def _page(log: LoopLog, setup: str, figures: Sequence[Path]) -> str:
             (html.data_url(one.read_bytes(), "png"), _CAPTIONS[one.name]) for one in figures
         ],
     }
-    return html.page("follow.html", content)
+    path = out / PAGE
+    with writing(path):
+        replace_text(path, html.page("follow.html", content))
+    return path
 
 
 _CAPTIONS = {

@@ -151,7 +151,7 @@ class Development:
         # The least of the three gains is 1, so that a clipped pixel is white.
         raw = np.minimum(raw * (balance / balance.min()), 1.0).astype(np.float32)
         raw = np.clip(_mixed(raw, filters.correcting), 0.0, 1.0)
-        return self._finish(self._toned(raw))
+        return self._finish(raw)
 
     def _gains(self, raw: Rgb, t: float) -> tuple[float, FloatArray]:
         """Return the gain of all colours and those of red, green and blue, from the mean picture.
@@ -175,13 +175,11 @@ class Development:
             raw = np.asarray(raw + noise, dtype=np.float32)
         return np.asarray(np.clip(raw * np.float32(gain), 0.0, 1.0), dtype=np.float32)
 
-    def _toned(self, linear: Rgb) -> Rgb:
+    def _finish(self, linear: Rgb) -> NDArray[np.uint8]:
+        """Apply the tone curve, sharpen the luma, blur the chroma, and round to 8 bits."""
         grey = linear ** np.float32(1.0 / self.gamma)
         grey += np.float32(self.contrast) * (grey * grey * (3.0 - 2.0 * grey) - grey)
-        return np.asarray(self.black + (1.0 - self.black) * grey, dtype=np.float32)
-
-    def _finish(self, grey: Rgb) -> NDArray[np.uint8]:
-        """Sharpen the luma, blur the chroma, and round to 8 bits."""
+        grey = np.asarray(self.black + (1.0 - self.black) * grey, dtype=np.float32)
         luma = cv2.transform(grey, LUMA[None].astype(np.float32))
         chroma = _blurred(grey - luma[..., None], self.chroma_px)
         if self.sharpening > 0.0:

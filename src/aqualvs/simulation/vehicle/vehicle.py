@@ -240,7 +240,10 @@ class SimulatedVehicle:
         end = self._time + dt
         while self._time < end:
             self._take_what_has_come()
-            self._fly(min(end, self._next_change(end)))
+            # Until the stick positions in force change.
+            arrives = self._coming[0][0] if self._coming else end
+            lapses = self._heard + self.lapse
+            self._fly(min(end, arrives, lapses if lapses > self._time + 1e-9 else end))
         self._take_what_has_come()
 
     def telemetry(self) -> Telemetry:
@@ -277,12 +280,6 @@ class SimulatedVehicle:
     def _take_what_has_come(self) -> None:
         while self._coming and self._coming[0][0] <= self._time + 1e-12:
             self._heard, self._effort = self._coming.popleft()
-
-    def _next_change(self, end: float) -> float:
-        """Return the time of the next change of the stick positions in force."""
-        arrives = self._coming[0][0] if self._coming else end
-        ends = self._heard + self.lapse
-        return min(arrives, ends if ends > self._time + 1e-9 else end)
 
     def _fly(self, end: float) -> None:
         duration = end - self._time
