@@ -112,33 +112,23 @@ class Coverage:
         if by_bearing:
             radius = self.options.radius
             aside = np.zeros(len(rows)) if radius is None else aside / radius
-        return _grid(rows, places, aside, across, self.options)
+        up = self.options.seen_up * rows[:, 5]
+        width = self.options.bearing_cell if by_bearing else self.options.along_cell
+        down_edges = _edges(rows[:, 4] - up, rows[:, 4] + up, self.options.depth_cell)
+        across_edges = _edges(places - aside, places + aside, width)
+        seconds = np.zeros((max(len(down_edges) - 1, 0), max(len(across_edges) - 1, 0)))
+        for row, place, high, wide in zip(rows, places, up, aside, strict=True):
+            top, bottom = _cells(row[4] - high, row[4] + high, down_edges)
+            left, right = _cells(place - wide, place + wide, across_edges)
+            seconds[top:bottom, left:right] += row[1]
+        path = np.column_stack([rows[:, 0], places, rows[:, 4]])
+        return CoverageMap(across, down_edges, across_edges, seconds, path)
 
 
 def _joined(bearings: FloatArray) -> FloatArray:
     """Return bearings without jumps, or folded if they go round more than once."""
     joined = np.unwrap(bearings)
     return joined if np.ptp(joined) <= 2.0 * np.pi else bearings % (2.0 * np.pi)
-
-
-def _grid(
-    rows: FloatArray,
-    places: FloatArray,
-    aside: FloatArray,
-    across: Across,
-    options: CoverageOptions,
-) -> CoverageMap:
-    up = options.seen_up * rows[:, 5]
-    width = options.bearing_cell if across is Across.BEARING else options.along_cell
-    down_edges = _edges(rows[:, 4] - up, rows[:, 4] + up, options.depth_cell)
-    across_edges = _edges(places - aside, places + aside, width)
-    seconds = np.zeros((max(len(down_edges) - 1, 0), max(len(across_edges) - 1, 0)))
-    for row, place, high, wide in zip(rows, places, up, aside, strict=True):
-        top, bottom = _cells(row[4] - high, row[4] + high, down_edges)
-        left, right = _cells(place - wide, place + wide, across_edges)
-        seconds[top:bottom, left:right] += row[1]
-    path = np.column_stack([rows[:, 0], places, rows[:, 4]])
-    return CoverageMap(across, down_edges, across_edges, seconds, path)
 
 
 def _edges(low: FloatArray, high: FloatArray, size: float) -> FloatArray:

@@ -20,13 +20,10 @@ from aqualvs.experiments import experiment as catalogue
 from aqualvs.experiments.experiment import Experiment
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.experiments.page import (
-    FIGURES,
+    FAILURES,
+    FILES,
     FRAME,
     PAGE,
-    RESULTS,
-    SERIES,
-    TIMES,
-    WORK,
     Record,
     is_reproduced,
     read_results,
@@ -151,8 +148,6 @@ def time_left_text(seconds: float) -> str:
 
 Load: TypeAlias = Callable[[str], Experiment]
 
-_FAILURES = "failures"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproduceRequest:
@@ -177,8 +172,7 @@ def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.expe
     `OptionError` if a name is not known, `OutputError` if the folder cannot be written.
     """
     names = catalogue.ordered(request.names)
-    written = (PAGE, RESULTS, TIMES, FIGURES, SERIES, WORK, _FAILURES)
-    files = [request.out / name for name in written]
+    files = [request.out / name for name in FILES]
     known = files if is_reproduced(request.out) else []
     claim = Claim("reproduce", files, overwrite=True, known=known)
     with experiment_bar(names) as bar:
@@ -223,7 +217,7 @@ class _Records:
 
     def _record(self, name: str, load: Load, laboratory: Laboratory) -> Record:
         found: Experiment | None = None
-        kept = self.folder / _FAILURES / f"{name}.txt"
+        kept = self.folder / FAILURES / f"{name}.txt"
         try:
             found = load(name)
             record = save_outcome(found, found.run(laboratory), self.folder)
@@ -254,7 +248,7 @@ def _line(record: Record, seconds: float) -> str:
     if record.failure:
         return (
             f"{record.name}: failed: {record.failure}; the full traceback is in "
-            f"{_FAILURES}/{record.name}.txt"
+            f"{FAILURES}/{record.name}.txt"
         )
     missed = [finding.what for finding in record.findings if finding.met is False]
     more = f" MISSED: {'; '.join(missed)}." if missed else ""

@@ -139,7 +139,11 @@ def scene(name: str) -> Scenario:
 
 
 def _run(laboratory: Laboratory) -> ExperimentResult:
-    seen = {name: _seen(laboratory, name) for name in _SCENES}
+    seen = {}
+    for name in _SCENES:
+        dive = laboratory.dive(scene(name))
+        ours, papers_way = laboratory.measure(dive), laboratory.measure(dive, PAPERS_WAY)
+        seen[name] = MeasuredScene(dive, ours, papers_way, visible_points(laboratory, dive))
     valid = {name: one.valid_percent(one.ours) for name, one in seen.items()}
     papers = {name: one.valid_percent(one.papers) for name, one in seen.items()}
     return ExperimentResult(
@@ -164,16 +168,6 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "Errors are relative to the plane through the lit points: growth stands out from the "
             "net, and the lasers measure to it.",
         ),
-    )
-
-
-def _seen(laboratory: Laboratory, name: str) -> MeasuredScene:
-    dive = laboratory.dive(scene(name))
-    return MeasuredScene(
-        dive,
-        laboratory.measure(dive),
-        laboratory.measure(dive, PAPERS_WAY),
-        visible_points(laboratory, dive),
     )
 
 

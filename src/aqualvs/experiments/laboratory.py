@@ -94,17 +94,15 @@ class MeasuredDive:
     def values(self) -> FloatArray:
         """Range (m), pitch and yaw (rad) of each frame, NaN where refused; shape (N, 3)."""
         nothing = (np.nan,) * 3
-        return np.array(
-            [nothing if p is None else (p.range, p.pitch, p.yaw) for p in self.postures]
-        ).reshape(-1, 3)
+        rows = [nothing if p is None else (p.range, p.pitch, p.yaw) for p in self.postures]
+        return np.array(rows).reshape(-1, 3)
 
     @property
     def sigmas(self) -> FloatArray:
         """One standard deviation of `values`, shape (N, 3)."""
-        variances = [
-            np.full(3, np.nan) if p is None else np.diag(p.covariance) for p in self.postures
-        ]
-        return np.asarray(np.sqrt(np.array(variances).reshape(-1, 3)))
+        nothing = np.full(3, np.nan)
+        rows = [nothing if p is None else np.diag(p.covariance) for p in self.postures]
+        return np.asarray(np.sqrt(np.array(rows).reshape(-1, 3)))
 
     def columns(self, k: int) -> dict[str, FloatArray]:
         """Return truth, value and sigma of range (0), pitch (1) or yaw (2) as columns."""

@@ -44,6 +44,9 @@ from aqualvs.report.html import Card
 from aqualvs.results.files import writing
 
 RESULTS, TIMES, FIGURES, SERIES, WORK = "results.json", "times.json", "figures", "series", "work"
+PAGE, FAILURES = "reproduce.html", "failures"
+FILES = (PAGE, RESULTS, TIMES, FIGURES, SERIES, WORK, FAILURES)
+"""All files and folders that the command writes into its folder."""
 DOI = "10.3390/robotics10040126"
 
 _FORMATS: Mapping[str, Mapping[str, str | None]] = {
@@ -217,7 +220,6 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
         path.write_text(text, encoding="utf-8", errors="replace")
 
 
-PAGE = "reproduce.html"
 FRAME = "a frame"
 """Key of the scanner's median time for one frame among the durations."""
 

@@ -72,9 +72,8 @@ def _draw_numbers(figure: Figure, wet: IndexSeries, n_each: int) -> None:
         low, high = (wet.ours + k * wet.sigma - minus for k in (-2.0, 2.0))
         axes.fill_between(number, low, high, step="mid", color=OURS, alpha=0.18, linewidth=0.0)
         axes.plot(number, wet.ours - minus, "o", color=OURS, markersize=2.6, label="ours, ± 2 σ")
-        axes.plot(
-            number, wet.paper - minus, "x", color=PAPER, markersize=3.5, label="the paper's way"
-        )
+        papers = wet.paper - minus
+        axes.plot(number, papers, "x", color=PAPER, markersize=3.5, label="the paper's way")
         axes.grid(axis="x", visible=False)
     lower.axhline(0.0, color=TRUTH, linewidth=0.9)
     upper.set(ylabel="index of the water", ylim=(wet.truth.min() - 4e-3, wet.truth.max() + 14e-3))
@@ -330,15 +329,10 @@ def _findings(
 
 
 def _series(numbers: IndexSeries, spread: Decentred) -> tuple[DataColumns, ...]:
+    names = ("n_true", "n_ours", "sigma_ours", "n_paper")
     frames = DataColumns(
         name="frames",
-        columns={
-            "frame": np.arange(len(numbers.truth)),
-            "n_true": numbers.truth,
-            "n_ours": numbers.ours,
-            "sigma_ours": numbers.sigma,
-            "n_paper": numbers.paper,
-        },
+        columns={"frame": np.arange(len(numbers.truth)), **dict(zip(names, numbers, strict=True))},
     )
     lens = DataColumns(
         name="decentred",

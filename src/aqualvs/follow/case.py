@@ -122,7 +122,6 @@ class Trials:
     rendered: bool = False  # Render and scan pictures; otherwise, sample postures with noise.
     fps: float = 25.0  # Frames a second.
     seed: int = 0  # Random seed of waves and noise.
-    waves: float = 0.1  # Amplitude in metres.
 
     def begin(self, seconds: float) -> LoopLog:
         """Hold the range to a flat net, from rest in the current."""
@@ -158,7 +157,7 @@ class Trials:
         return SimCase(
             model=self.model,
             gains=self.gains,
-            water=sea(waves=self.waves, seed=self.seed),
+            water=sea(seed=self.seed),
             net=net,
             start_range=RANGE,
             timing=Timing(fps=self.fps),

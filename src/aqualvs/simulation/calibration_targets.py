@@ -5,7 +5,7 @@ a box of markers, and of a plate in the view.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -122,20 +122,6 @@ def _centred(turn: FloatArray, middle: FloatArray, size: Size) -> SE3:
 FAMILY = "DICT_APRILTAG_36h11"
 
 
-class _PrintOptions(NamedTuple):
-    """Printed targets of rendered pictures: sizes of cells in metres, and their look."""
-
-    # Pictures narrower than this get larger prints, whose markers can still be read.
-    narrow_px: int = 600
-    wall_cell: float = 2e-3
-    plate_cell: float = 1e-3
-    albedo: float = 0.55
-    mottle: float = 0.16
-
-
-_PRINTS = _PrintOptions()
-
-
 _CORNER_ORDER = (
     "as OpenCV reports: top-left, top-right, bottom-right, bottom-left of the upright marker"
 )
@@ -161,10 +147,16 @@ class Marked:
         return self.panel.dome_from_panel.apply(np.concatenate([flat, depth], axis=-1))
 
 
+def _is_narrow(width_px: int) -> bool:
+    """Return whether a picture needs larger prints, whose markers can still be read."""
+    narrow_px = 600
+    return width_px < narrow_px
+
+
 def hand_board(width_px: int) -> CharucoPrint:
     """Return the board that is held before the bare camera."""
     return CharucoPrint(
-        squares=(11, 8) if width_px >= _PRINTS.narrow_px else (7, 5),
+        squares=(7, 5) if _is_narrow(width_px) else (11, 8),
         square=24e-3,
         marker=18e-3,
         border=12e-3,
@@ -204,11 +196,10 @@ def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Pane
 
 def marker_box(width_px: int) -> list[Marked]:
     """Return the walls of an open box, 400 x 380 x 700 mm inside, in `box`."""
-    side = 24 if width_px >= _PRINTS.narrow_px else 32
-    # Inside of the box: width, depth, height in cells of its walls.
-    wide, deep, high = 200, 350, 190
-    half_wide, half_high = 0.5 * wide * _PRINTS.wall_cell, 0.5 * high * _PRINTS.wall_cell
-    depth = deep * _PRINTS.wall_cell
+    side = 32 if _is_narrow(width_px) else 24
+    # Inside of the box: width, depth, height in cells of its walls, whose side is in metres.
+    wide, deep, high, cell = 200, 350, 190, 2e-3
+    half_wide, half_high, depth = 0.5 * wide * cell, 0.5 * high * cell, deep * cell
     x, y, z = np.eye(3)
     # Name, cells across and down, top-left corner, directions across and down as seen from inside.
     walls = (
@@ -222,10 +213,9 @@ def marker_box(width_px: int) -> list[Marked]:
         places = grid_corners(*(_places(n, side) for n in cells))
         pose = SE3(np.column_stack([across, down, np.cross(across, down)]), np.array(corner))
         prints = _prints(first, places, side, side // 6)
-        albedo = mottled(cells[::-1], _PRINTS.albedo, _PRINTS.mottle, scale=0.8, shift=97 * k)
-        marked.append(
-            Marked(name, Panel(pose, marker_texture(albedo, _PRINTS.wall_cell, prints)), prints)
-        )
+        plywood = mottled(cells[::-1], albedo=0.55, contrast=0.16, scale=0.8, shift=97 * k)
+        panel = Panel(pose, marker_texture(plywood, cell, prints))
+        marked.append(Marked(name, panel, prints))
         first += len(places)
     return marked
 
@@ -240,12 +230,13 @@ def _places(cells: int, side: int) -> IntArray:
 
 def marker_plate() -> Marked:
     """Return a plate of six markers, in a frame of its own."""
-    side, gap = 24, 6
+    # In cells, whose side is in metres.
+    side, gap, cell = 24, 6, 1e-3
     places = grid_corners(*(gap + (side + gap) * np.arange(n) for n in (3, 2)))
     first_on_plate = 300
     prints = _prints(first_on_plate, places, side, 0)
     paper = np.full((2 * side + 3 * gap, 3 * side + 4 * gap), PAPER)
-    panel = Panel(SE3.identity(), marker_texture(paper, _PRINTS.plate_cell, prints))
+    panel = Panel(SE3.identity(), marker_texture(paper, cell, prints))
     return Marked("plate", panel, prints)
 
 

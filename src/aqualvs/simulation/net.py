@@ -107,18 +107,6 @@ class _TwineLook(NamedTuple):
 _TWINE = _TwineLook()
 
 
-class _FoldSteps(NamedTuple):
-    """Search along a ray for a folded net."""
-
-    # Least step along a ray towards a folded net, and number of bisections of the last step.
-    step: float = 1e-3
-    max_steps: int = 200
-    halvings: int = 16
-
-
-_STEPS = _FoldSteps()
-
-
 class Strand(NamedTuple):
     """Intersection of a ray with a strand."""
 
@@ -203,21 +191,23 @@ def _next_crossing(o: Vec, d: Vec, s: "Surfaces", i: int, begin: float) -> float
         return t if t > begin else np.inf
     first, last = _crossing(o, d, s.nets, i, low), _crossing(o, d, s.nets, i, high)
     t = max(min(first, last), begin)
-    end = max(first, last) + _STEPS.step
+    # Least step along a ray towards a folded net, and number of bisections of the last step.
+    least_step, max_steps, halvings = 1e-3, 200, 16
+    end = max(first, last) + least_step
     if not end < 1e6:
         return np.inf
     # The height over the net limits the distance to it along the ray from below.
     share = 1.0 / (1.5 + steepest)
     side = _behind(o, d, t, s, i)
-    for _ in range(_STEPS.max_steps):
+    for _ in range(max_steps):
         if t >= end:
             break
-        step = max(share * abs(side), _STEPS.step)
+        step = max(share * abs(side), least_step)
         now = _behind(o, d, t + step, s, i)
         if side * now <= 0.0:
             # By bisection, where the ray changes sides of the net.
             before, after = t, t + step
-            for _ in range(_STEPS.halvings):
+            for _ in range(halvings):
                 middle = 0.5 * (before + after)
                 if side * _behind(o, d, middle, s, i) > 0.0:
                     before = middle
