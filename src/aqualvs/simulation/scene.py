@@ -189,14 +189,6 @@ class Scene:
     sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True  # False switches all lasers off.
 
-    def at(self, t: float) -> "Scene":
-        """Return the scene with fish and bubbles moved on by `t` seconds."""
-        return replace(
-            self,
-            fish=tuple(fish.at(t) for fish in self.fish),
-            bubbles=tuple(bubble.at(t) for bubble in self.bubbles),
-        )
-
     def target_plane(self) -> Plane:
         """Return the target plane in `dome`, its normal away from the vehicle."""
         normal = self.dome_from_scene.rotation[:, 1]

@@ -125,15 +125,6 @@ def _pack_box(box: Box, pose: SE3) -> FloatArray:
 
 
 @inline_borrowing_kernel
-def meet_wall(o: Vec, d: Vec, walls: FloatArray, i: int) -> float:
-    """Return the distance to a wall; infinite behind the ray's origin."""
-    normal = row3(walls, i, _NORMAL)
-    t = dot(minus(row3(walls, i, _ORIGIN), o), normal) / dot(d, normal)
-    far = 1e3
-    return t if 0.0 < t < far else np.inf
-
-
-@inline_borrowing_kernel
 def _to_local(v: Vec, table: FloatArray, i: int) -> Vec:
     """Turn a vector by the three rows that start in column 3."""
     return (
@@ -179,10 +170,12 @@ def meet_box(o: Vec, d: Vec, boxes: FloatArray, i: int) -> tuple[float, Vec]:
 @inline_borrowing_kernel
 def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: int) -> Hit:
     """Return the first opaque surface on a ray, with the ellipsoids members[first:last]."""
+    far = 1e3
     t, kind, index, normal, met = np.inf, NONE, 0, (0.0, 0.0, 0.0), NO_STRAND
     for i in range(s.walls.shape[0]):
-        reach = meet_wall(o, d, s.walls, i)
-        if reach < t:
+        face_normal = row3(s.walls, i, _NORMAL)
+        reach = dot(minus(row3(s.walls, i, _ORIGIN), o), face_normal) / dot(d, face_normal)
+        if 0.0 < reach < far and reach < t:
             t, kind, index = reach, WALL, i
     for i in range(s.nets.shape[0]):
         strand = meet_net(o, d, s, i)
