@@ -8,13 +8,7 @@ import pytest
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.experiments import experiment as catalogue
 from aqualvs.experiments import page as records
-from aqualvs.experiments.command import (
-    TYPICAL_S,
-    ReproduceRequest,
-    TimeLeft,
-    reproduce,
-    time_left_text,
-)
+from aqualvs.experiments.command import ReproduceRequest, TimeLeft, reproduce, time_left_text
 from aqualvs.experiments.experiment import (
     DataColumns,
     Experiment,
@@ -198,8 +192,8 @@ def test_time_left_follows_the_pace_of_this_machine():
     left.end()
     assert left.share > share
     # 20 s of trust and 50 measured, over 20 and what is typical of the one that is done.
-    ahead = TYPICAL_S["dome"] + TYPICAL_S["box"]
-    assert left.seconds == pytest.approx(ahead * 70.0 / (20.0 + TYPICAL_S["rig"]))
+    rig, dome, box = (catalogue.MODULES[name][1] for name in ("rig", "dome", "box"))
+    assert left.seconds == pytest.approx((dome + box) * 70.0 / (20.0 + rig))
     assert left.seconds > 2.0 * first
     for name in ("dome", "box"):
         left.start(name)

@@ -156,15 +156,6 @@ def test_pilot_takes_over_by_changing_the_mode() -> None:
     assert loop.link.effort == Effort()
 
 
-def test_closed_link_sends_nothing_more() -> None:
-    link = loop_of(CALM).link
-    link.send(Effort(forward=0.5))
-    link.close()
-    assert link.effort == Effort()
-    link.send(Effort(forward=0.5))
-    assert link.effort == Effort()
-
-
 def test_csv_has_units_and_empty_cells(tmp_path: Path) -> None:
     log = loop_of(ROUGH, (Blind(0.5, 0.6),)).run(1.0)
     path = tmp_path / "truth.csv"

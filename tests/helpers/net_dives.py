@@ -91,7 +91,9 @@ class Dive:
 
     def scene_at(self, t: float) -> Scene:
         """All that is before the vehicle."""
-        return replace(self.scene.at(t), dome_from_scene=self.pose(t))
+        fish = tuple(one.at(t) for one in self.scene.fish)
+        bubbles = tuple(one.at(t) for one in self.scene.bubbles)
+        return replace(self.scene, dome_from_scene=self.pose(t), fish=fish, bubbles=bubbles)
 
 
 def random_dive(

@@ -159,39 +159,23 @@ class AnswerWatch:
         self._effort = effort
 
     def see(self, now_s: float, posture: Posture, state: VehicleState) -> LimitReason | None:
-        """Add a new posture; return why it cannot be used, None if it can.
-
-        Parameters
-        ----------
-        posture : Posture
-            Of a frame that has not been seen before.
-        state : VehicleState
-            As the vehicle reports it.
-        """
-        if not all(map(math.isfinite, (now_s, posture.range, posture.pitch, posture.yaw))):
+        """Add the posture of a new frame; return why it cannot be used, None if it can."""
+        seen = (posture.range, posture.pitch, posture.yaw)
+        if not all(map(math.isfinite, (now_s, *seen))):
             return None
         push = self._advance(now_s, posture.yaw, state)
-        vanished = self._noise.vanished(posture)
-        if self._repeats(now_s, posture) or vanished:
+        vanished = self._noise.vanished(seen)
+        if self._repeats(now_s, seen) or vanished:
             self._blind_s = _TRUSTED_S
             if vanished:
                 # None where frames were missing just before, or the watch has begun anew.
                 n = min(_N_NOISE, len(self._moments))
                 self._still_s = now_s - self._moments[-n].time_s if n else 0.0
             return LimitReason.FROZEN
-        moment = _Moment(
-            now_s,
-            posture.range,
-            posture.pitch,
-            posture.yaw,
-            push,
-            self._balance,
-            self._speed,
-            self._way,
-            math.nan if state.heading is None else self._heading,
-            math.nan if state.pitch is None else state.pitch,
-        )
-        self._moments.append(moment)
+        heading = math.nan if state.heading is None else self._heading
+        attitude = math.nan if state.pitch is None else state.pitch
+        moved = (push, self._balance, self._speed, self._way)
+        self._moments.append(_Moment(now_s, *seen, *moved, heading, attitude))
         del self._moments[: self._first_within(self.limits.long_window_s + _GAP_S)]
         stands = self._has_stopped() or self._is_unanswered() or self._does_not_follow()
         return LimitReason.NO_ANSWER if stands else None
@@ -233,9 +217,8 @@ class AnswerWatch:
         force = self._vehicle.mass * speed / length_s
         return Brake(thrust.effort(force / thrust.backward), now_s + length_s)
 
-    def _repeats(self, now_s: float, posture: Posture) -> bool:
+    def _repeats(self, now_s: float, found: tuple[float, float, float]) -> bool:
         """Return whether the posture has been the same to the bit while an effort was in force."""
-        found = (posture.range, posture.pitch, posture.yaw)
         if found != self._last:
             self._last, self._same_s, self._frozen = found, now_s, False
         elif self._pushed_s >= self._same_s and now_s - self._same_s >= self.limits.repeats_s:
@@ -438,9 +421,9 @@ class _Noise:
         self._usual = [0.0, 0.0, 0.0]
         self._n = 0
 
-    def vanished(self, posture: Posture) -> bool:
-        """Add a posture; return whether the noise has almost vanished."""
-        self._postures.append((posture.range, posture.pitch, posture.yaw))
+    def vanished(self, posture: tuple[float, float, float]) -> bool:
+        """Add range, pitch and yaw; return whether the noise has almost vanished."""
+        self._postures.append(posture)
         if len(self._postures) < 3:
             return False
         rows = zip(*self._postures, strict=True)

@@ -44,26 +44,14 @@ class Decision:
     effort: Effort  # What may be sent; neutral unless engaged.
     # Why it is not what the controller asked for, or why that is no more than to stay.
     reason: LimitReason | None
-    # What the mission wanted.
-    guidance: Guidance
-    # Whether efforts pass; False until `NetPilot.engage`.
-    engaged: bool
+    guidance: Guidance  # What the mission wanted.
+    engaged: bool  # Whether efforts pass; False until `NetPilot.engage`.
 
 
 class NetPilot:
     """Autopilot that holds and follows by the measured posture.
 
-    Parameters
-    ----------
-    mission : Mission
-        What to do.
-    controller : RangeYawController
-        Made for the vehicle.
-
-    Raises
-    ------
-    OptionError
-        If the mission moves sideways and the vehicle cannot.
+    Raises `OptionError` if the mission moves sideways and the vehicle of the controller cannot.
     """
 
     def __init__(
@@ -145,17 +133,14 @@ class NetPilot:
         )
         self._watch.done(now_s, effort)
         self._report_sent(asked, effort, reason)
-        reason = self._stop_if_lost(guidance) or reason or _mission_reason(guidance)
+        if guidance.stage is Stage.GAVE_UP:
+            # The target stayed away: the pilot gets the vehicle back.
+            reason = LimitReason.GAVE_UP
+            self.gate.stop(reason)
+        reason = reason or _mission_reason(guidance)
         if reason is None and self.gate.tips(state):
             reason = LimitReason.TIPPING
         return Decision(effort, reason, guidance, self.engaged)
-
-    def _stop_if_lost(self, guidance: Guidance) -> LimitReason | None:
-        """Give the vehicle back where the target stayed away; return why."""
-        if guidance.stage is not Stage.GAVE_UP:
-            return None
-        self.gate.stop(LimitReason.GAVE_UP)
-        return LimitReason.GAVE_UP
 
     def _stream_restarted(self, time_s: float) -> bool:
         """Return whether frame times have jumped back; then all that was seen is forgotten."""

@@ -36,8 +36,7 @@ class PidOptions:
     # Limits of the output.
     low: float = -math.inf
     high: float = math.inf
-    # Greatest change of the output per second.
-    output_rate: float = math.inf
+    output_rate: float = math.inf  # Greatest change of the output per second.
     # Seconds between two updates beyond which nothing is integrated and the derivative starts anew.
     longest_step: float = 0.5
 
@@ -50,33 +49,22 @@ class Pid:
     included (clamping; Åström and Hägglund 2006, Advanced PID control, section 3.5). What is not a
     finite number, and a time that stands still or steps back, changes nothing: the last output is
     returned. A time that steps back by more than `longest_step` is that of another stream.
-
-    `options`: gains and limits.
     """
 
     def __init__(self, options: PidOptions) -> None:
         self.options = options
+        self._slope = _Slope(options.derivative_time)
         self.reset()
-
-    @property
-    def integral(self) -> float:
-        """The integral's share of the output."""
-        return self._integral
 
     def reset(self) -> None:
         """Forget everything; the next update starts with output 0."""
-        self._integral = self._output = self._rate = 0.0
-        self._time_s = math.nan
-        self._measured = math.nan
+        self.integral = 0.0  # The integral's share of the output.
+        self.pause()
 
     def pause(self) -> None:
         """Expect the next update after a stop: output 0 till then, the integral stays."""
-        self._output = self._rate = 0.0
-        self._time_s = self._measured = math.nan
-
-    def fade(self, kept: float) -> None:
-        """Forget all but a share of the integral."""
-        self._integral *= kept
+        self._output, self._time_s = 0.0, math.nan
+        self._slope.reset()
 
     def applied(self, output: float) -> None:
         """Correct the last output by the value that the actuator applied, where it is limited."""
@@ -110,45 +98,36 @@ class Pid:
         longest = self.options.longest_step
         if not all(map(math.isfinite, values)) or -longest <= step <= 0.0:
             return self._output
-        counts = 0.0 < step <= longest
-        self._rate = self._rate_after(step if counts else math.nan, measured, rate)
-        self._time_s, self._measured = time_s, measured
-        self._output = self._moved(step if counts else 0.0, setpoint - measured, forward, schedule)
+        if not 0.0 < step <= longest:
+            step = 0.0
+            self._slope.reset()
+        rate = self._slope.update(step, measured, rate)
+        self._time_s = time_s
+        self._output = self._moved(step, setpoint - measured, rate, forward, schedule)
         return self._output
 
-    def _rate_after(self, step: float, measured: float, rate: float | None) -> float:
-        if rate is not None:
-            return rate
-        if math.isnan(step):
-            return 0.0
-        # Backward Euler: any step is stable.
-        slope = (measured - self._measured) / step
-        share = step / (step + self.options.derivative_time)
-        return self._rate + share * (slope - self._rate)
-
     def _moved(
-        self, step: float, error: float, forward: float, schedule: tuple[float, float]
+        self, step: float, error: float, rate: float, forward: float, schedule: tuple[float, float]
     ) -> float:
         """Return the output, and integrate unless that drives it further beyond its limits."""
         options = self.options
         growth = options.integral * schedule[1] * error * step
         straight = options.proportional * schedule[0] * error
-        rest = straight - options.derivative * self._rate + forward
-        wanted = rest + self._integral + growth
-        allowed = self._limited(self._near_last(wanted, step))
+        rest = straight - options.derivative * rate + forward
+        wanted = rest + self.integral + growth
+        allowed = self._allowed(wanted, step)
         if (wanted - allowed) * growth > 0.0:
-            return self._limited(self._near_last(rest + self._integral, step))
-        self._integral += growth
+            return self._allowed(rest + self.integral, step)
+        self.integral += growth
         return allowed
 
-    def _near_last(self, wanted: float, step: float) -> float:
+    def _allowed(self, wanted: float, step: float) -> float:
+        """Return the output within its limits, and those of its change."""
         first_step_s = 0.04
         # The first update has no time step; its output may change as much as in a short one.
         most = self.options.output_rate * (step or first_step_s)
-        return min(max(wanted, self._output - most), self._output + most)
-
-    def _limited(self, output: float) -> float:
-        return min(max(output, self.options.low), self.options.high)
+        wanted = min(max(wanted, self._output - most), self._output + most)
+        return min(max(wanted, self.options.low), self.options.high)
 
 
 class SwellFilter:
@@ -291,40 +270,33 @@ class RangeYawController:
     the loop is as fast in a current as at rest. A PI loop for the yaw asks for a turning rate,
     which the vehicle's own autopilot keeps.
 
-    Parameters
-    ----------
-    gains : ControlGains
-        For one vehicle.
-
-    Notes
-    -----
     Time is that of the frames. Two frames of one time, or one that is late, change nothing.
     """
 
     def __init__(self, gains: ControlGains) -> None:
         self.gains = gains
         thrust, mass = gains.vehicle.thrust, gains.vehicle.mass
+        near, turn = gains.range, gains.yaw
         self._speed = Pid(
             PidOptions(
-                proportional=gains.range.speed,
-                integral=gains.range.integral,
+                proportional=near.speed,
+                integral=near.integral,
                 low=-thrust.backward / mass,
                 high=thrust.forward / mass,
-                output_rate=gains.range.jerk,
+                output_rate=near.jerk,
             )
         )
         self._turn = Pid(
             PidOptions(
-                proportional=gains.yaw.proportional,
-                integral=gains.yaw.integral,
-                derivative=gains.yaw.derivative,
+                proportional=turn.proportional,
+                integral=turn.integral,
+                derivative=turn.derivative,
                 derivative_time=gains.rate_time,
-                low=-gains.yaw.greatest_rate,
-                high=gains.yaw.greatest_rate,
-                output_rate=gains.yaw.acceleration,
+                low=-turn.greatest_rate,
+                high=turn.greatest_rate,
+                output_rate=turn.acceleration,
             )
         )
-        near, turn = gains.range, gains.yaw
         self._range_ramp = Ramp(
             near.ramp_speed, near.ramp_acceleration, near.lag, near.approach_speed
         )
@@ -341,26 +313,22 @@ class RangeYawController:
 
     def reset(self) -> None:
         """Forget everything; the next update starts from neutral, at the posture it finds."""
-        self._speed.reset()
-        self._turn.reset()
-        self._slope.reset()
-        self._swell.reset()
-        self._let_go()
-        self._time_s = math.nan
-        self._stopped_s = math.nan
+        self._time_s = self._stopped_s = math.nan
         self._running = False
         self._effort = Effort()
+        self._speed.reset()
+        self._turn.reset()
+        self.pause()
 
     def pause(self) -> None:
         """Stop: neutral until the next update, which starts with the known current."""
         if self._running:
             self._stopped_s = self._time_s
         self._running = False
-        self._speed.pause()
-        self._turn.pause()
-        self._slope.reset()
-        self._swell.reset()
-        self._let_go()
+        self._forget_motion()
+        # Thrusters and turning begin at rest.
+        for part in (*self._pairs, self._quiet):
+            part.reset()
 
     def applied(self, effort: Effort) -> None:
         """Correct the last effort by the one that was sent in its place."""
@@ -406,36 +374,29 @@ class RangeYawController:
         self._time_s = time_s
         self._range_ramp.step(setpoint.range, step)
         self._yaw_ramp.step(setpoint.yaw, step)
-        turn = self._turning(time_s, yaw, yaw_rate)
+        # The derivative acts on the measurement; the ramp's own rate is added back.
+        ramp = self._yaw_ramp
+        ahead = ramp.rate + self.gains.yaw.derivative * ramp.seen_rate
+        turn = -self._turn.update(time_s, ramp.seen, yaw, yaw_rate, ahead)
         forward, right = self._forces(step, range, yaw, rate, sway, turn)
         self._effort = self._as_effort(step, forward, right, turn, down)
         return self._effort
 
-    def _let_go(self) -> None:
-        """Begin with thrusters and turning at rest."""
-        for pair in self._pairs:
-            pair.reset()
-        self._quiet.reset()
+    def _forget_motion(self) -> None:
+        self._speed.pause()
+        self._turn.pause()
+        self._slope.reset()
+        self._swell.reset()
 
     def _start(self, time_s: float, range: float, yaw: float) -> None:
         """Begin at a posture, with the remembered part of the disturbance."""
         if not 0.0 <= time_s - self._stopped_s <= self.gains.memory:
             self._speed.reset()
             self._turn.reset()
-        self._speed.pause()
-        self._turn.pause()
-        self._slope.reset()
-        self._swell.reset()
+        self._forget_motion()
         self._range_ramp.start(range)
         self._yaw_ramp.start(yaw)
         self._time_s, self._running = time_s, True
-
-    def _turning(self, time_s: float, yaw: float, yaw_rate: float | None) -> float:
-        """Return the turning rate asked for, clockwise."""
-        ramp = self._yaw_ramp
-        # The derivative acts on the measurement; the ramp's own rate is added back.
-        forward = ramp.rate + self.gains.yaw.derivative * ramp.seen_rate
-        return -self._turn.update(time_s, ramp.seen, yaw, yaw_rate, forward)
 
     def _forces(
         self, step: float, range: float, yaw: float, rate: float, sway: float, turn: float
@@ -446,7 +407,9 @@ class RangeYawController:
         c, s = math.cos(psi), math.sin(psi)
         side = sway * c if vehicle.can_sway else 0.0
         aside = (side + vehicle.dome_forward * turn) * s
-        mending = self._mending(range)
+        # Closing speed that corrects the range's error.
+        gains = self.gains.range
+        mending = clipped(gains.position * (range - ramp.seen), gains.greatest_speed)
         # Speeds and accelerations along the forward axis.
         ahead = (mending - ramp.rate - aside) / c
         asked, found = (mending - ramp.seen_rate) / c, -rate / c
@@ -474,14 +437,8 @@ class RangeYawController:
         small = max(abs(self._speed.integral), swell) < self._least
         if not (small and all(pair.turns for pair in self._pairs)):
             return False
-        self._speed.fade(math.exp(-max(step, 0.0) / _FORGETS_S))
+        self._speed.integral *= math.exp(-max(step, 0.0) / _FORGETS_S)
         return True
-
-    def _mending(self, range: float) -> float:
-        """Return the closing speed that corrects the range's error."""
-        gains = self.gains.range
-        wanted = gains.position * (range - self._range_ramp.seen)
-        return clipped(wanted, gains.greatest_speed)
 
     def _against_drag(self, ahead: float) -> tuple[float, tuple[float, float]]:
         """Return the acceleration that keeps a speed, in addition to the integral.
@@ -491,9 +448,8 @@ class RangeYawController:
         does, and lets gain and integral be greater.
         """
         vehicle = self.gains.vehicle
-        held = vehicle.mass * self._speed.integral
-        passing = vehicle.forward_drag.speed(held)
-        drag = vehicle.forward_drag
+        drag, held = vehicle.forward_drag, vehicle.mass * self._speed.integral
+        passing = drag.speed(held)
         damping = drag.slope(passing) / vehicle.mass
         push = (drag.force(ahead + passing) - held) / vehicle.mass
         return push, gain_schedule(self.gains.range, damping)

@@ -45,10 +45,7 @@ class CoverageOptions:
     radius: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse sizes that are not positive.
-
-        Raises `OptionError` naming them.
-        """
+        """Raise `OptionError` naming the sizes if one is not positive."""
         sizes = (self.depth_cell, self.bearing_cell, self.along_cell)
         if not min(sizes) > 0.0:
             raise OptionError(f"coverage: cells of {sizes}; every size must be positive")
@@ -68,15 +65,8 @@ class CoverageMap:
     # Shape (M + 1,): radians, or metres. Bearings go on beyond a full turn where that joins them;
     # those of more than a turn are folded into 0 to 2 pi.
     across_edges: FloatArray
-    # Shape (N, M): for how long each cell was in view; 0 is unseen.
-    seconds: FloatArray
-    # Shape (K, 3): time, place across and depth of the vehicle's foot on the net.
-    path: FloatArray
-
-    @property
-    def seen_share(self) -> float:
-        """Share of the map's cells that were seen; 0 without any."""
-        return float(np.mean(self.seconds > 0.0)) if self.seconds.size else 0.0
+    seconds: FloatArray  # Shape (N, M): for how long each cell was in view; 0 is unseen.
+    path: FloatArray  # Shape (K, 3): time, place across and depth of the vehicle's foot on the net.
 
 
 class Coverage:
@@ -117,42 +107,28 @@ class Coverage:
         by_bearing = len(rows) > 0 and bool(np.isfinite(rows[:, 2]).all())
         across = Across.BEARING if by_bearing else Across.ALONG
         places = _joined(rows[:, 2]) if by_bearing else rows[:, 3]
-        aside = self._aside(rows[:, 5], across)
-        return _grid(rows, places, aside, across, self.options)
-
-    def _aside(self, ranges: FloatArray, across: Across) -> FloatArray:
-        """Return how far to either side is seen, in the unit of the map."""
-        metres = self.options.seen_aside * ranges
-        if across is Across.ALONG:
-            return metres
-        radius = self.options.radius
-        return np.zeros(len(ranges)) if radius is None else metres / radius
+        # How far to either side is seen, in the unit of the map.
+        aside = self.options.seen_aside * rows[:, 5]
+        if by_bearing:
+            radius = self.options.radius
+            aside = np.zeros(len(rows)) if radius is None else aside / radius
+        up = self.options.seen_up * rows[:, 5]
+        width = self.options.bearing_cell if by_bearing else self.options.along_cell
+        down_edges = _edges(rows[:, 4] - up, rows[:, 4] + up, self.options.depth_cell)
+        across_edges = _edges(places - aside, places + aside, width)
+        seconds = np.zeros((max(len(down_edges) - 1, 0), max(len(across_edges) - 1, 0)))
+        for row, place, high, wide in zip(rows, places, up, aside, strict=True):
+            top, bottom = _cells(row[4] - high, row[4] + high, down_edges)
+            left, right = _cells(place - wide, place + wide, across_edges)
+            seconds[top:bottom, left:right] += row[1]
+        path = np.column_stack([rows[:, 0], places, rows[:, 4]])
+        return CoverageMap(across, down_edges, across_edges, seconds, path)
 
 
 def _joined(bearings: FloatArray) -> FloatArray:
     """Return bearings without jumps, or folded if they go round more than once."""
     joined = np.unwrap(bearings)
     return joined if np.ptp(joined) <= 2.0 * np.pi else bearings % (2.0 * np.pi)
-
-
-def _grid(
-    rows: FloatArray,
-    places: FloatArray,
-    aside: FloatArray,
-    across: Across,
-    options: CoverageOptions,
-) -> CoverageMap:
-    up = options.seen_up * rows[:, 5]
-    width = options.bearing_cell if across is Across.BEARING else options.along_cell
-    down_edges = _edges(rows[:, 4] - up, rows[:, 4] + up, options.depth_cell)
-    across_edges = _edges(places - aside, places + aside, width)
-    seconds = np.zeros((max(len(down_edges) - 1, 0), max(len(across_edges) - 1, 0)))
-    for row, place, high, wide in zip(rows, places, up, aside, strict=True):
-        top, bottom = _cells(row[4] - high, row[4] + high, down_edges)
-        left, right = _cells(place - wide, place + wide, across_edges)
-        seconds[top:bottom, left:right] += row[1]
-    path = np.column_stack([rows[:, 0], places, rows[:, 4]])
-    return CoverageMap(across, down_edges, across_edges, seconds, path)
 
 
 def _edges(low: FloatArray, high: FloatArray, size: float) -> FloatArray:

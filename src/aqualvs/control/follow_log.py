@@ -13,30 +13,10 @@ from aqualvs.errors import OutputError
 from aqualvs.scanning.posture import Posture, Refusal
 
 FOLLOW_COLUMNS = (
-    "time_s",
-    "frame_time_s",
-    "engaged",
-    "stage",
-    "reason",
-    "posture",
-    "range_m",
-    "pitch_deg",
-    "yaw_deg",
-    "range_setpoint_m",
-    "yaw_setpoint_deg",
-    "range_error_m",
-    "yaw_error_deg",
-    "sway_m_s",
-    "down_m_s",
-    "forward",
-    "right",
-    "down",
-    "yaw",
-    "armed",
-    "mode",
-    "depth_m",
-    "heading_deg",
-    "bearing_deg",
+    *("time_s", "frame_time_s", "engaged", "stage", "reason"),
+    *("posture", "range_m", "pitch_deg", "yaw_deg", "range_setpoint_m", "yaw_setpoint_deg"),
+    *("range_error_m", "yaw_error_deg", "sway_m_s", "down_m_s", "forward", "right", "down", "yaw"),
+    *("armed", "mode", "depth_m", "heading_deg", "bearing_deg"),
 )
 """`posture` is "valid" or the reason of a refusal; errors are measured less wanted. Unknown values
 are empty."""
@@ -70,7 +50,25 @@ class FollowLog(Closing):
 
         Raises `OutputError` if it cannot be written.
         """
-        row = follow_row(now_s, frame_time_s, posture, decision, state)
+        guidance, effort = decision.guidance, decision.effort
+        row = dict.fromkeys(FOLLOW_COLUMNS, "") | _seen(posture, decision, state)
+        row |= {
+            "time_s": f"{now_s:.4f}",
+            "frame_time_s": f"{frame_time_s:.4f}",
+            "engaged": str(int(decision.engaged)),
+            "stage": guidance.stage.value,
+            "reason": "" if decision.reason is None else decision.reason.value,
+            "sway_m_s": f"{guidance.sway:.4f}",
+            "down_m_s": f"{guidance.down:.4f}",
+            "forward": f"{effort.forward:.4f}",
+            "right": f"{effort.right:.4f}",
+            "down": f"{effort.down:.4f}",
+            "yaw": f"{effort.yaw:.4f}",
+            "armed": str(int(state.armed)),
+            "mode": state.mode_name or state.mode.value,
+            "depth_m": "" if state.depth is None else f"{state.depth:.3f}",
+            "heading_deg": _degrees(state.heading),
+        }
         self._append([row[name] for name in FOLLOW_COLUMNS])
 
     def close(self) -> None:
@@ -90,36 +88,6 @@ class FollowLog(Closing):
             f"{self._path}: cannot be written ({fault.strerror}); make room, or "
             "choose another place"
         )
-
-
-def follow_row(
-    now_s: float,
-    frame_time_s: float,
-    posture: Posture | Refusal | None,
-    decision: Decision,
-    state: VehicleState,
-) -> dict[str, str]:
-    """Return the cells of one step by column."""
-    guidance, effort = decision.guidance, decision.effort
-    row = dict.fromkeys(FOLLOW_COLUMNS, "")
-    row |= {
-        "time_s": f"{now_s:.4f}",
-        "frame_time_s": f"{frame_time_s:.4f}",
-        "engaged": str(int(decision.engaged)),
-        "stage": guidance.stage.value,
-        "reason": "" if decision.reason is None else decision.reason.value,
-        "sway_m_s": f"{guidance.sway:.4f}",
-        "down_m_s": f"{guidance.down:.4f}",
-        "forward": f"{effort.forward:.4f}",
-        "right": f"{effort.right:.4f}",
-        "down": f"{effort.down:.4f}",
-        "yaw": f"{effort.yaw:.4f}",
-        "armed": str(int(state.armed)),
-        "mode": state.mode_name or state.mode.value,
-        "depth_m": _number(state.depth, 3),
-        "heading_deg": _degrees(state.heading),
-    }
-    return row | _seen(posture, decision, state)
 
 
 def _seen(
@@ -145,10 +113,6 @@ def _seen(
         row["range_error_m"] = f"{posture.range - wanted.range:.5f}"
         row["yaw_error_deg"] = _degrees(posture.yaw - wanted.yaw)
     return row
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
 
 
 def _degrees(angle: float | None) -> str:

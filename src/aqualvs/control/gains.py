@@ -34,18 +34,12 @@ class ThrustMap:
     forward: float
     backward: float
     right: float
-    # Effort below which nothing happens.
-    dead_band: float = 0.0
-    # Share of the curve that is straight.
-    linear: float = 1.0
-    # Of the level thrusters.
-    layout: Layout = Layout.VECTORED
+    dead_band: float = 0.0  # Effort below which nothing happens.
+    linear: float = 1.0  # Share of the curve that is straight.
+    layout: Layout = Layout.VECTORED  # Of the level thrusters.
 
     def __post_init__(self) -> None:
-        """Refuse maps that cannot be inverted.
-
-        Raises `OptionError` if a thrust is not positive or a share none.
-        """
+        """Raise `OptionError` if a thrust is not positive or a share none: no inverse exists."""
         if not (min(self.forward, self.backward) > 0.0 and self.right >= 0.0):
             raise OptionError(
                 f"thrust: forward {self.forward:g}, backward {self.backward:g}, right "
@@ -59,8 +53,12 @@ class ThrustMap:
 
     def effort(self, share: float) -> float:
         """Return the effort for a share of the full thrust, both -1 to 1."""
-        size = min(abs(share), 1.0)
-        return math.copysign(self._past_dead_band(size), share) if size > 0.0 else 0.0
+        size, bent = min(abs(share), 1.0), 1.0 - self.linear
+        if not size > 0.0:
+            return 0.0
+        # Root of bent x² + linear x = size, in the form that is valid for bent = 0.
+        x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
+        return math.copysign(self.dead_band + (1.0 - self.dead_band) * x, share)
 
     def share(self, effort: float) -> float:
         """Return the share of the full thrust that an effort gives, both -1 to 1."""
@@ -99,12 +97,6 @@ class ThrustMap:
         ahead, aside = self.joined(*map(self.share, self.split(forward, right)))
         return ahead * (self.forward if ahead > 0.0 else self.backward), aside * self.right
 
-    def _past_dead_band(self, size: float) -> float:
-        bent = 1.0 - self.linear
-        # Root of bent x² + linear x = size, in the form that is valid for bent = 0.
-        x = 2.0 * size / (self.linear + math.sqrt(self.linear**2 + 4.0 * bent * size))
-        return self.dead_band + (1.0 - self.dead_band) * x
-
 
 class DeadBandCrossing:
     """Effort of one pair of thrusters, whose dead band is crossed once, with hysteresis.
@@ -114,12 +106,7 @@ class DeadBandCrossing:
     is owed is taken off the thrust that follows on the side in force: so the mean thrust is the one
     asked for, and noise about zero neither crosses nor pushes.
 
-    Parameters
-    ----------
-    impulse : float
-        Share of the full thrust, times seconds.
-    great : float
-        Share of the full thrust that crosses at once.
+    `impulse`: share of the full thrust, times seconds. `great`: share that crosses at once.
     """
 
     def __init__(self, thrust: ThrustMap, impulse: float, great: float) -> None:
@@ -203,14 +190,10 @@ class VehicleFacts:
     # At effort 1, in rad/s and m/s.
     turning_rate: float
     climb_rate: float
-    # Distance of the dome's centre ahead of the vehicle's, in metres.
-    dome_forward: float = 0.0
+    dome_forward: float = 0.0  # Distance of the dome's centre ahead of the vehicle's, in metres.
 
     def __post_init__(self) -> None:
-        """Refuse impossible vehicles.
-
-        Raises `OptionError` if a number is not positive.
-        """
+        """Raise `OptionError` if a number is not positive."""
         check_positive(f"vehicle {self.name}", self, "mass", "turning_rate", "climb_rate")
         for drag in (self.forward_drag, self.right_drag):
             if not (min(drag.linear, drag.quadratic) >= 0.0 < drag.linear + drag.quadratic):
@@ -235,15 +218,12 @@ class RangeGains:
     # Time from an effort until pictures show it, in seconds: so much later a setpoint's change is
     # expected to be seen.
     lag: float
-    # Asked for towards and away from the target, in m/s.
-    greatest_speed: float = 0.25
-    # With which a new setpoint is approached, in m/s and m/s².
-    ramp_speed: float = 0.15
+    greatest_speed: float = 0.25  # Asked for towards and away from the target, in m/s.
+    ramp_speed: float = 0.15  # With which a new setpoint is approached, in m/s and m/s².
     # In place of `ramp_speed` towards the target, where that is faster, in m/s: for vehicles that
     # coast far when the picture stands still and thrust ends.
     approach_speed: float = 0.15
-    # As `ramp_speed`.
-    ramp_acceleration: float = 0.12
+    ramp_acceleration: float = 0.12  # As `ramp_speed`.
     # Greatest change of the acceleration asked for, per second. What it holds back comes late: with
     # 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
     jerk: float = 30.0
@@ -259,10 +239,7 @@ class RangeGains:
     swell_damping: float = 0.15
 
     def __post_init__(self) -> None:
-        """Refuse gains that are not positive; integral and swell may be 0.
-
-        Raises `OptionError` naming the first.
-        """
+        """Raise `OptionError` naming the first gain that is negative, or 0 where it must not be."""
         free = ("integral", "lag", "swell", "crossing_impulse", "crossing_share")
         check_positive("range", self, *(name for name in self.__slots__ if name not in free))
         check_not_negative("range", self, *free)
@@ -275,25 +252,18 @@ class YawGains:
     proportional: float  # Turning rate by the yaw's error, in rad/s per rad.
     # Turning rate by error and second, in rad/s² per rad: what a curved target asks for.
     integral: float
-    # As of the range.
-    lag: float
-    # Turning rate by the yaw's rate; 0 or more.
-    derivative: float = 0.0
-    # Turning rate, in rad/s.
-    greatest_rate: float = math.radians(30.0)
+    lag: float  # As of the range.
+    derivative: float = 0.0  # Turning rate by the yaw's rate; 0 or more.
+    greatest_rate: float = math.radians(30.0)  # Turning rate, in rad/s.
     # With which a new setpoint is approached, in rad/s and rad/s².
     ramp_rate: float = math.radians(15.0)
     ramp_acceleration: float = math.radians(15.0)
     # Greatest change of the turning rate asked for, in rad/s².
     acceleration: float = math.radians(200.0)
-    # Turning rate below which no turn begins, in rad/s.
-    quiet_rate: float = math.radians(0.8)
+    quiet_rate: float = math.radians(0.8)  # Turning rate below which no turn begins, in rad/s.
 
     def __post_init__(self) -> None:
-        """Refuse gains that are not positive; integral, derivative and lag may be 0.
-
-        Raises `OptionError` naming the first.
-        """
+        """Raise `OptionError` naming the first gain that is negative, or 0 where it must not be."""
         free = ("integral", "derivative", "lag", "quiet_rate")
         check_positive("yaw", self, *(name for name in self.__slots__ if name not in free))
         check_not_negative("yaw", self, *free)
@@ -312,10 +282,7 @@ class ControlGains:
     memory: float = 10.0
 
     def __post_init__(self) -> None:
-        """Refuse times that are not positive.
-
-        Raises `OptionError` naming the first.
-        """
+        """Raise `OptionError` naming the first time that is not positive."""
         check_positive("controller", self, "rate_time", "memory")
 
 

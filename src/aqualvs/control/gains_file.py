@@ -164,33 +164,7 @@ def save_gains(gains: ControlGains, path: Path) -> None:
 
 def gains_text(gains: ControlGains) -> str:
     """Return gains as the text of a file."""
-    content = _content(gains).model_dump()
-    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-    return _HEADER + text
-
-
-def _gains(content: GainsFile) -> ControlGains:
-    return ControlGains(
-        vehicle=_vehicle(content),
-        range=RangeGains(**si_values(content.range)),
-        yaw=YawGains(**si_values(content.yaw)),
-        rate_time=content.rate_time_s,
-        memory=content.memory_s,
-    )
-
-
-def _vehicle(content: GainsFile) -> VehicleFacts:
-    part = content.vehicle
-    parts = {
-        "forward_drag": Drag(**si_values(part.forward_drag)),
-        "right_drag": Drag(**si_values(part.right_drag)),
-        "thrust": ThrustMap(**si_values(part.thrust) | {"layout": Layout(part.thrust.layout)}),
-    }
-    return VehicleFacts(name=content.name, **si_values(part) | parts)
-
-
-def _content(gains: ControlGains) -> GainsFile:
-    return GainsFile(
+    content = GainsFile(
         aqualvs_gains=VERSION,
         name=gains.vehicle.name,
         vehicle=_in_file_units(VehiclePart, gains.vehicle),
@@ -198,4 +172,22 @@ def _content(gains: ControlGains) -> GainsFile:
         yaw=_in_file_units(YawPart, gains.yaw),
         rate_time_s=gains.rate_time,
         memory_s=gains.memory,
+    )
+    text: str = yaml.safe_dump(content.model_dump(), sort_keys=False, allow_unicode=True)
+    return _HEADER + text
+
+
+def _gains(content: GainsFile) -> ControlGains:
+    part = content.vehicle
+    parts = {
+        "forward_drag": Drag(**si_values(part.forward_drag)),
+        "right_drag": Drag(**si_values(part.right_drag)),
+        "thrust": ThrustMap(**si_values(part.thrust) | {"layout": Layout(part.thrust.layout)}),
+    }
+    return ControlGains(
+        vehicle=VehicleFacts(name=content.name, **si_values(part) | parts),
+        range=RangeGains(**si_values(content.range)),
+        yaw=YawGains(**si_values(content.yaw)),
+        rate_time=content.rate_time_s,
+        memory=content.memory_s,
     )

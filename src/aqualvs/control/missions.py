@@ -6,9 +6,9 @@
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
 
 from aqualvs.control.vehicle import Setpoint, VehicleState, clipped
 from aqualvs.errors import OptionError, check_positive
@@ -46,28 +46,6 @@ class Guidance:
     stage: Stage = Stage.HOLDING
 
 
-class Mission(Protocol):
-    """Plan that is updated by the states of vehicle and target."""
-
-    sways: bool  # Whether it needs a vehicle that can move sideways.
-
-    def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Return the present guidance.
-
-        Parameters
-        ----------
-        now_s : float
-            Monotonic, in seconds. Only steps forward of up to a second count as time spent.
-        posture : Posture or None
-            The present one; None where there is none. While disengaged there are no updates.
-        state : VehicleState
-            Depth and heading are used where they are known.
-        """
-
-    def restart(self) -> None:
-        """Begin with the next update to go on after a stop: time spent so far stays."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossOptions:
     """Behaviour without the target."""
@@ -77,10 +55,7 @@ class LossOptions:
     give_up: float = 10.0  # Seconds of waiting after which it ends.
 
     def __post_init__(self) -> None:
-        """Refuse impossible values.
-
-        Raises `OptionError` if one is not positive.
-        """
+        """Raise `OptionError` if a value is impossible."""
         if not (self.after > 0.0 and self.steady >= 0.0 and self.give_up > self.after):
             raise OptionError(
                 f"loss: after {self.after:g} s, steady {self.steady:g} s, give up "
@@ -96,16 +71,14 @@ class LossWatch:
 
     def __init__(self, options: LossOptions | None = None) -> None:
         self.options = options or LossOptions()
-        self.stage: Stage | None = None  # WAITING, GAVE_UP, or None while the target is there.
-        # Time since the last update that counts as spent with the target, in seconds.
-        self.spent_s = 0.0
-        self._last_s = math.nan
-        self._away_s = 0.0
-        self._back_s = 0.0
+        self.restart()
 
     def restart(self) -> None:
         """Start anew with the target there."""
-        self.stage, self.spent_s = None, 0.0
+        # WAITING, GAVE_UP, or None while the target is there.
+        self.stage: Stage | None = None
+        # Time since the last update that counts as spent with the target, in seconds.
+        self.spent_s = 0.0
         self._last_s, self._away_s, self._back_s = math.nan, 0.0, 0.0
 
     def update(self, now_s: float, there: bool) -> Stage | None:
@@ -130,17 +103,42 @@ class LossWatch:
             self.stage = Stage.WAITING
 
 
-class HoldMission:
+class Mission(ABC):
+    """Plan that is updated by the states of vehicle and target.
+
+    `setpoint`: range and yaw to hold, which may be changed at any time. `loss`: what to do without
+    the target.
+    """
+
+    sways = True  # Whether it needs a vehicle that can move sideways.
+
+    def __init__(self, setpoint: Setpoint | None, loss: LossOptions | None = None) -> None:
+        self.setpoint = setpoint
+        self._watch = LossWatch(loss)
+
+    @abstractmethod
+    def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
+        """Return the present guidance.
+
+        Parameters
+        ----------
+        now_s : float
+            Monotonic, in seconds. Only steps forward of up to a second count as time spent.
+        posture : Posture or None
+            The present one; None where there is none. While disengaged there are no updates.
+        state : VehicleState
+            Depth and heading are used where they are known.
+        """
+
+    def restart(self) -> None:
+        """Begin with the next update to go on after a stop: time spent so far stays."""
+        self._watch.restart()
+
+
+class HoldMission(Mission):
     """Hold a range and yaw, for some time or for good; after that time it holds on.
 
-    Parameters
-    ----------
-    setpoint : Setpoint or None
-        Kept in `setpoint`, which may be changed at any time.
-    duration : float, optional
-        Seconds with the target after which it is `Stage.OVER`; endless if left out.
-    loss : LossOptions, optional
-        What to do without the target.
+    `duration`: seconds with the target after which it is `Stage.OVER`.
     """
 
     sways = False
@@ -154,14 +152,9 @@ class HoldMission:
     ) -> None:
         if not duration > 0.0:
             raise OptionError(f"hold: duration {duration:g} s; must be positive")
-        self.setpoint = setpoint
+        super().__init__(setpoint, loss)
         self._duration = duration
-        self._watch = LossWatch(loss)
         self._spent_s = 0.0
-
-    def restart(self) -> None:
-        """Go on after a stop."""
-        self._watch.restart()
 
     def update(
         self,
@@ -172,10 +165,8 @@ class HoldMission:
         """Return the setpoint, at rest."""
         lost = self._watch.update(now_s, posture is not None)
         self._spent_s += self._watch.spent_s
-        if lost is Stage.GAVE_UP:
-            return Guidance(setpoint=None, stage=lost)
-        here = Stage.OVER if self._spent_s >= self._duration else Stage.HOLDING
-        return Guidance(setpoint=self.setpoint, stage=lost or here)
+        over = self._spent_s >= self._duration
+        return guidance_along(self.setpoint, 0.0, lost, over, going=Stage.HOLDING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,10 +194,7 @@ class LegOptions:
     sector: Sector | None = None
 
     def __post_init__(self) -> None:
-        """Refuse impossible values.
-
-        Raises `OptionError` if a time or distance is not positive.
-        """
+        """Raise `OptionError` if a time or distance is not positive."""
         if not (self.time > 0.0 and self.distance > 0.0):
             raise OptionError(
                 f"leg: time {self.time:g} s, distance {self.distance:g} m; must be positive"
@@ -218,18 +206,15 @@ class LegOptions:
         return math.isfinite(min(self.time, self.distance)) or self.sector is not None
 
 
-def bearing_of(posture: Posture, state: VehicleState) -> float | None:
+def bearing_of(posture: Posture | None, state: VehicleState) -> float | None:
     """Return the compass direction of the target's far normal, in [0, 2 pi); None if unknown."""
-    if state.heading is None or not math.isfinite(state.heading + posture.yaw):
+    if posture is None or state.heading is None or not math.isfinite(state.heading + posture.yaw):
         return None
     return (state.heading + posture.yaw) % (2.0 * math.pi)
 
 
 class Leg:
-    """One way along the net, with the time and distance covered.
-
-    `options`: where it ends.
-    """
+    """One way along the net, with the time and distance covered."""
 
     def __init__(self, options: LegOptions) -> None:
         self._options = options
@@ -251,27 +236,12 @@ class Leg:
         self._inside |= inside
 
 
-class FollowMission:
+class FollowMission(Mission):
     """Go along the net in one direction.
 
-    Parameters
-    ----------
-    setpoint : Setpoint
-        Range and yaw on the way.
-    sway : float
-        Speed through the water, to the right positive, in m/s.
-    leg : LegOptions, optional
-        Where it ends; never if left out.
-    loss : LossOptions, optional
-        What to do without the target.
-
-    Raises
-    ------
-    OptionError
-        If the speed is 0.
+    `sway`: speed through the water, to the right positive, in m/s. `leg`: where it ends; never if
+    left out. Raises `OptionError` if the speed is 0.
     """
-
-    sways = True
 
     def __init__(
         self,
@@ -283,29 +253,30 @@ class FollowMission:
     ) -> None:
         if not (sway != 0.0 and math.isfinite(sway)):
             raise OptionError(f"follow: speed {sway:g} m/s; choose one, or hold instead")
-        self.setpoint, self._sway = setpoint, sway
+        super().__init__(setpoint, loss)
+        self._sway = sway
         self._leg = Leg(leg or LegOptions())
-        self._watch = LossWatch(loss)
-
-    def restart(self) -> None:
-        """Go on after a stop."""
-        self._watch.restart()
 
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
         """Return setpoint and speed."""
         lost = self._watch.update(now_s, posture is not None)
-        bearing = None if posture is None else bearing_of(posture, state)
-        self._leg.go(self._watch.spent_s, self._sway, bearing)
+        self._leg.go(self._watch.spent_s, self._sway, bearing_of(posture, state))
         return guidance_along(self.setpoint, self._sway, lost, self._leg.done)
 
 
-def guidance_along(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Guidance:
+def guidance_along(
+    setpoint: Setpoint | None,
+    sway: float,
+    lost: Stage | None,
+    done: bool,
+    going: Stage = Stage.FOLLOWING,
+) -> Guidance:
     """Return the guidance along the net, or at its end, or without the target."""
     if lost is Stage.GAVE_UP:
         return Guidance(setpoint=None, stage=lost)
     if lost is not None or done:
         return Guidance(setpoint=setpoint, stage=lost or Stage.OVER)
-    return Guidance(setpoint=setpoint, sway=sway, stage=Stage.FOLLOWING)
+    return Guidance(setpoint=setpoint, sway=sway, stage=going)
 
 
 # Speed of descent by a depth's error, in m/s per m, and the tolerance of a depth.
@@ -335,10 +306,7 @@ class SurveyOptions:
     patience: float = 20.0
 
     def __post_init__(self) -> None:
-        """Refuse surveys without end or direction.
-
-        Raises `OptionError` naming the value.
-        """
+        """Raise `OptionError` naming the value if a survey has no end or direction."""
         if not self.depths or not all(depth >= 0.0 for depth in self.depths):
             raise OptionError(f"survey: depths {list(self.depths)} m; give one or more, 0 or more")
         if not (self.sway != 0.0 and math.isfinite(self.sway)):
@@ -348,30 +316,18 @@ class SurveyOptions:
         check_positive("survey", self, "descent", "patience")
 
 
-class SurveyMission:
+class SurveyMission(Mission):
     """Legs along the net, one at each depth.
 
     The vehicle's own depth hold keeps the depth on the way; between legs it is asked to sink or
     rise, holding range and yaw. Without a known depth, changes wait.
-
-    Parameters
-    ----------
-    setpoint : Setpoint
-        Range and yaw on the way.
-    options : SurveyOptions
-        The lawn.
-    loss : LossOptions, optional
-        What to do without the target.
     """
-
-    sways = True
 
     def __init__(
         self, setpoint: Setpoint, options: SurveyOptions, *, loss: LossOptions | None = None
     ) -> None:
-        self.setpoint = setpoint
+        super().__init__(setpoint, loss)
         self._options = options
-        self._watch = LossWatch(loss)
         self.i_leg = 0  # The leg gone now, or whose depth is sought; counts from 0.
         self._leg: Leg | None = None
         self._begin_change()
@@ -381,10 +337,6 @@ class SurveyMission:
         """Depth of the present leg, in metres."""
         return self._options.depths[min(self.i_leg, len(self._options.depths) - 1)]
 
-    def restart(self) -> None:
-        """Go on after a stop."""
-        self._watch.restart()
-
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
         """Return the guidance of the leg or the change of depth."""
         lost = self._watch.update(now_s, posture is not None)
@@ -392,9 +344,10 @@ class SurveyMission:
         if over or lost is not None:
             return guidance_along(self.setpoint, 0.0, lost, over)
         if self._leg is None and not self._depth_reached(state):
-            return Guidance(
-                setpoint=self.setpoint, down=self._descent(state), stage=Stage.CHANGING_DEPTH
-            )
+            down = 0.0
+            if state.depth is not None and math.isfinite(state.depth):
+                down = clipped(_DESCENT_GAIN * (self.depth - state.depth), self._options.descent)
+            return Guidance(setpoint=self.setpoint, down=down, stage=Stage.CHANGING_DEPTH)
         return self._along(posture, state)
 
     def _along(self, posture: Posture | None, state: VehicleState) -> Guidance:
@@ -402,7 +355,7 @@ class SurveyMission:
         leg = self._leg = self._leg or Leg(self._options.leg)
         back = self._options.turn is Turn.BACK and self.i_leg % 2 == 1
         sway = -self._options.sway if back else self._options.sway
-        leg.go(self._watch.spent_s, sway, None if posture is None else bearing_of(posture, state))
+        leg.go(self._watch.spent_s, sway, bearing_of(posture, state))
         if not leg.done:
             return guidance_along(self.setpoint, sway, None, False)
         self.i_leg += 1
@@ -413,12 +366,6 @@ class SurveyMission:
         self._leg = None
         self._changing_s = self._steady_s = 0.0
         self._allowed_s = math.inf
-
-    def _descent(self, state: VehicleState) -> float:
-        """Return the speed of descent towards the leg's depth."""
-        if state.depth is None or not math.isfinite(state.depth):
-            return 0.0
-        return clipped(_DESCENT_GAIN * (self.depth - state.depth), self._options.descent)
 
     def _depth_reached(self, state: VehicleState) -> bool:
         # Seconds that a depth must be kept before the next leg, longer than a wave.

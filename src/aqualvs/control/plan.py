@@ -99,12 +99,19 @@ class Plan:
         content = self._file
         loss = LossOptions(**si_values(content.loss))
         leg, sway = _leg(content), content.sway_m_s or 0.0
-        if content.survey is not None:
-            return SurveyMission(self.setpoint, _survey(content.survey, leg, sway), loss=loss)
+        if (survey := content.survey) is not None:
+            options = SurveyOptions(
+                depths=_depths(survey),
+                sway=sway,
+                leg=leg,
+                turn=Turn(survey.turn),
+                descent=survey.descent_m_s,
+                patience=survey.patience_s,
+            )
+            return SurveyMission(self.setpoint, options, loss=loss)
         if self.name == "follow":
             return FollowMission(self.setpoint, sway, leg=leg, loss=loss)
-        duration = math.inf if content.duration_s is None else content.duration_s
-        return HoldMission(self.setpoint, duration=duration, loss=loss)
+        return HoldMission(self.setpoint, duration=content.duration_s or math.inf, loss=loss)
 
 
 def load_plan(path: Path | str) -> Plan:
@@ -163,25 +170,9 @@ def _check_setpoint(setpoint: Setpoint, limits: SafetyLimits) -> None:
 
 def _leg(content: PlanFile) -> LegOptions:
     part = content.leg or LegPart()
-    sector = None
-    if part.bearings_deg is not None:
-        begin, end = (math.radians(bearing) for bearing in part.bearings_deg)
-        sector = Sector(begin, end)
+    sector = None if part.bearings_deg is None else Sector(*map(math.radians, part.bearings_deg))
     return LegOptions(
-        time=math.inf if part.time_s is None else part.time_s,
-        distance=math.inf if part.distance_m is None else part.distance_m,
-        sector=sector,
-    )
-
-
-def _survey(part: SurveyPart, leg: LegOptions, sway: float) -> SurveyOptions:
-    return SurveyOptions(
-        depths=_depths(part),
-        sway=sway,
-        leg=leg,
-        turn=Turn(part.turn),
-        descent=part.descent_m_s,
-        patience=part.patience_s,
+        time=part.time_s or math.inf, distance=part.distance_m or math.inf, sector=sector
     )
 
 

@@ -7,7 +7,7 @@ rules as a table.
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple, Self
 
@@ -57,7 +57,7 @@ class LimitReason(StrEnum):
     @property
     def takes_over(self) -> bool:
         """Whether the pilot must engage again before efforts pass."""
-        return self in _TAKES_OVER
+        return self not in _PASSING | _STEERS
 
     @property
     def steers(self) -> bool:
@@ -65,23 +65,18 @@ class LimitReason(StrEnum):
         return self in _STEERS
 
 
-_TAKES_OVER = frozenset(
-    {
-        LimitReason.NOT_ENGAGED,
-        LimitReason.NO_HEARTBEAT,
-        LimitReason.DISARMED,
-        LimitReason.PILOT_MODE,
-        LimitReason.NO_STATION,
-        LimitReason.IGNORED,
-        LimitReason.CONFLICT,
-        LimitReason.UNKNOWN_MODE,
-        LimitReason.PILOT_STICKS,
-        LimitReason.NO_ANSWER,
-        LimitReason.GAVE_UP,
-    }
-)
 _STEERS = frozenset(
     {LimitReason.TOO_CLOSE, LimitReason.TOO_FAST, LimitReason.MISSION_OVER, LimitReason.TIPPING}
+)
+# What stops a vehicle for as long as it lasts.
+_PASSING = frozenset(
+    {
+        LimitReason.CLOCK,
+        LimitReason.FROZEN,
+        LimitReason.NO_POSTURE,
+        LimitReason.NOT_FINITE,
+        LimitReason.NO_SETPOINT,
+    }
 )
 
 _REFUSED_MODES = {
@@ -116,8 +111,7 @@ class SafetyLimits:
     heartbeat_age: float = 1.0
     # Metres to the target, from the dome's centre, within which nothing approaches.
     least_range: float = 0.35
-    # Greatest closing speed far from the target, in m/s.
-    approach_speed: float = 0.3
+    approach_speed: float = 0.3  # Greatest closing speed far from the target, in m/s.
     # Seconds to the least range, at the present closing speed, that must remain: the speed allowed
     # shrinks with the way that is left.
     stopping_time: float = 0.7
@@ -132,10 +126,7 @@ class SafetyLimits:
     tilt: float = math.radians(45.0)
 
     def __post_init__(self) -> None:
-        """Refuse limits that cannot work.
-
-        Raises `OptionError` if one makes no sense.
-        """
+        """Raise `OptionError` if a limit makes no sense."""
         check_positive("safety", self, *self.__slots__)
         if self.posture_age > 0.2:
             raise OptionError(
@@ -216,7 +207,10 @@ class SafetyGate:
         brake : Brake
             That of the first of a row of doubts counts.
         """
-        refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state)
+        refused = self._clock_refuses(now_s)
+        if refused is None and self.latched is None:
+            self.latched = self._vehicle_refuses(now_s, state)
+        refused = refused or self.latched
         if refused is None and self._doubts(doubt, brake) is not None:
             return self._effort_in_doubt(now_s), self._doubt
         refused = refused or self._sight_refuses(posture_age_s, posture)
@@ -237,12 +231,6 @@ class SafetyGate:
             self._seen.clear()
             return LimitReason.CLOCK
         return None
-
-    def _vehicle_stops(self, now_s: float, state: VehicleState) -> LimitReason | None:
-        """Return why the vehicle may not be steered, until engaged again."""
-        if self.latched is None:
-            self.latched = self._vehicle_refuses(now_s, state)
-        return self.latched
 
     def _doubts(self, doubt: LimitReason | None, brake: Brake) -> LimitReason | None:
         """Return the doubt in force; one that gives the vehicle back stays while it brakes."""
@@ -293,11 +281,6 @@ class SafetyGate:
             return 0.0
         return (first - last) / (last_s - first_s)
 
-    def _retreat(self, within: float) -> float:
-        """Return the effort with which it backs away so far within the least range."""
-        gentle, firm = self.limits.retreat_effort, self.limits.brake_effort
-        return gentle + max(firm - gentle, 0.0) * min(within / _FIRM_WITHIN_M, 1.0)
-
     def _guarded(
         self, effort: Effort, near: float, closing: float
     ) -> tuple[Effort, LimitReason | None]:
@@ -305,7 +288,9 @@ class SafetyGate:
         limits = self.limits
         left = near - limits.least_range
         if left < 0.0:
-            return _backing(effort, self._retreat(-left)), LimitReason.TOO_CLOSE
+            gentle, firm = limits.retreat_effort, limits.brake_effort
+            back = gentle + max(firm - gentle, 0.0) * min(-left / _FIRM_WITHIN_M, 1.0)
+            return _backing(effort, back), LimitReason.TOO_CLOSE
         allowed = min(limits.approach_speed, left / limits.stopping_time)
         if closing > allowed:
             share = min((closing - allowed) / (_FIRM_ABOVE * allowed + 1e-6), 1.0)
@@ -329,9 +314,4 @@ def _backing(effort: Effort, least: float) -> Effort:
 
 
 def _clipped(effort: Effort) -> Effort:
-    return Effort(
-        forward=clipped(effort.forward),
-        right=clipped(effort.right),
-        down=clipped(effort.down),
-        yaw=clipped(effort.yaw),
-    )
+    return Effort(**{name: clipped(part) for name, part in asdict(effort).items()})

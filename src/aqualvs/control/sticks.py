@@ -65,10 +65,8 @@ class StickShaping:
     # Pilot gain (JS_GAIN_DEFAULT). Where trims are 1500 us it does not matter but for the rate of
     # climb.
     gain: float = 0.5
-    # JS_THR_GAIN.
-    throttle_gain: float = 1.0
-    # THR_DZ, in thousandths of the throttle's travel.
-    throttle_dead_zone: float = 100.0
+    throttle_gain: float = 1.0  # JS_THR_GAIN.
+    throttle_dead_zone: float = 100.0  # THR_DZ, in thousandths of the throttle's travel.
     # RC3 to RC6.
     throttle: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=30.0))
     yaw: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=40.0))
@@ -81,12 +79,8 @@ class StickShaping:
         An effort of 1 is a full stick, one of 0 the middle of the dead zone, and what is between
         is in proportion to what the vehicle does. Pulses are whole microseconds.
 
-        Parameters
-        ----------
-        effort : Effort
-            Of finite parts; limited to full deflection.
-        keeps_place : bool
-            Whether the mode is POSHOLD, whose level sticks have a dead zone.
+        `effort`: of finite parts; limited to full deflection. `keeps_place`: whether the mode is
+        POSHOLD, whose level sticks have a dead zone.
         """
         level = self.throttle_dead_zone * self.gain * 2.0 if keeps_place else 0.0
         return Sticks(
@@ -116,8 +110,15 @@ class StickShaping:
     @property
     def climbing_share(self) -> float:
         """Share of the greatest rate of climb or descent that full sticks ask for, either way."""
-        up, down = self._climbs()
-        return min(up, down)
+        channel, middle = self.throttle, self._middle()
+        low = channel.least + channel.dead_zone
+        swing_us = 0.5 * FULL * _UPRIGHT_US * self.gain * self.throttle_gain
+        per_us, dead = 1000.0 / (channel.most - low), self.throttle_dead_zone * self.gain
+        top = min(_CENTRE_US + swing_us, channel.most)
+        bottom = max(_CENTRE_US - swing_us, low)
+        up = ((top - low) * per_us - middle - dead) / (1000.0 - middle - dead)
+        down = (middle - dead - (bottom - low) * per_us) / (middle - dead)
+        return min(max(up, 0.0), min(max(down, 0.0), 1.0))
 
     def _axis(self, share: float, channel: StickChannel, dead_us: float) -> int:
         """Return the position of x, y or r."""
@@ -156,18 +157,6 @@ class StickShaping:
         channel = self.throttle
         low = channel.least + channel.dead_zone
         return 1000.0 * (0.5 * (channel.least + channel.most) - low) / (channel.most - low)
-
-    def _climbs(self) -> tuple[float, float]:
-        """Return the shares of the rates of climb and descent that full sticks ask for."""
-        channel, middle = self.throttle, self._middle()
-        low = channel.least + channel.dead_zone
-        swing_us = 0.5 * FULL * _UPRIGHT_US * self.gain * self.throttle_gain
-        per_us, dead = 1000.0 / (channel.most - low), self.throttle_dead_zone * self.gain
-        top = min(_CENTRE_US + swing_us, channel.most)
-        bottom = max(_CENTRE_US - swing_us, low)
-        up = ((top - low) * per_us - middle - dead) / (1000.0 - middle - dead)
-        down = (middle - dead - (bottom - low) * per_us) / (middle - dead)
-        return max(up, 0.0), min(max(down, 0.0), 1.0)
 
 
 PARAMETERS: tuple[str, ...] = (

@@ -21,13 +21,11 @@ class FilteredPosture:
     range: float
     pitch: float
     yaw: float
-    # Shape (3,): their time derivatives, in m/s and rad/s.
-    rates: FloatArray
+    rates: FloatArray  # Shape (3,): their time derivatives, in m/s and rad/s.
     # Shape (6, 6): of (range, pitch, yaw) and the rates, by the noise of the frames and the unknown
     # motion.
     covariance: FloatArray
-    # Time since the last measurement that entered.
-    age_s: float
+    age_s: float  # Time since the last measurement that entered.
     # Whether this frame's measurement entered; False where it was refused by the gate, or there was
     # none.
     accepted: bool
@@ -54,8 +52,7 @@ class PostureFilterOptions:
     # Standard deviation of the rates when the filter starts, in m/s and rad/s.
     initial_speed: float = 0.5
     initial_turn_rate: float = 0.5
-    # Share of sound measurements that pass the gate.
-    gate_probability: float = 0.9999
+    gate_probability: float = 0.9999  # Share of sound measurements that pass the gate.
     # Rejected measurements in a row that agree with each other, after which the filter accepts
     # them: the target itself is elsewhere. An angle alone begins anew after so many.
     n_rejected: int = 3
@@ -63,10 +60,7 @@ class PostureFilterOptions:
     max_coast: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check every value.
-
-        Raises `OptionError` if one makes no sense.
-        """
+        """Raise `OptionError` if a value makes no sense."""
         check_positive("time filter", self, *self.__slots__)
         if not self.gate_probability < 1.0:
             raise OptionError(
@@ -77,10 +71,7 @@ class PostureFilterOptions:
 class PostureFilter:
     """Kalman filter for range, pitch and yaw at constant rates, with a gate.
 
-    Parameters
-    ----------
-    options : PostureFilterOptions, optional
-        Defaults, for a small vehicle, if left out.
+    The default options are for a small vehicle.
 
     Notes
     -----
@@ -129,14 +120,25 @@ class PostureFilter:
         self._track = self._still_known(self._track, time_s)
         self._rival = self._still_known(self._rival, time_s)
         accepted = False
-        measured = _measurement(posture) if math.isfinite(time_s) else None
-        if measured is not None and isinstance(posture, Posture):
-            accepted = self._take(time_s, *measured)
+        if isinstance(posture, Posture) and math.isfinite(time_s):
+            measured = _measurement(posture)
+            accepted = measured is not None and self._take(time_s, *measured)
             if accepted and self._track is not None:
                 self._track = replace(self._track, rig_covariance=posture.rig_covariance)
         if self._track is None:
             return None
-        return self._motion.forecast(self._track, time_s).as_filtered(self._track, time_s, accepted)
+        ahead = self._motion.forecast(self._track, time_s)
+        distance, pitch, yaw = ahead.state[:3].tolist()
+        return FilteredPosture(
+            distance,
+            pitch,
+            yaw,
+            ahead.state[3:].copy(),
+            ahead.cov.copy(),
+            max(0.0, time_s - self._track.time_s),
+            accepted,
+            self._track.rig_covariance,
+        )
 
     def _still_known(self, track: "_Track | None", time_s: float) -> "_Track | None":
         """Return the track unless it is too old, or from another stream."""
@@ -183,32 +185,13 @@ class _Track:
     # Mean normalised square of the range's innovations; 1 where it moves as the model allows.
     surprise: float = 1.0
 
-    def as_filtered(self, known: "_Track", time_s: float, accepted: bool) -> FilteredPosture:
-        """Return this forecast in the words of the outputs."""
-        distance, pitch, yaw = self.state[:3].tolist()
-        age_s = max(0.0, time_s - known.time_s)
-        return FilteredPosture(
-            distance,
-            pitch,
-            yaw,
-            self.state[3:].copy(),
-            self.cov.copy(),
-            age_s,
-            accepted,
-            known.rig_covariance,
-        )
-
 
 class _Motion:
     """Motion model: forecast of a track, and its update by measurements."""
 
     def __init__(self, options: PostureFilterOptions) -> None:
-        accelerations = (
-            options.range_acceleration,
-            options.pitch_acceleration,
-            options.yaw_acceleration,
-        )
-        self._noise = np.diag(np.square(accelerations))
+        angles = options.pitch_acceleration, options.yaw_acceleration
+        self._noise = np.diag(np.square((options.range_acceleration, *angles)))
         self._n_rejected = options.n_rejected
         turn = options.initial_turn_rate
         self._initial_rates = np.diag(np.square((options.initial_speed, turn, turn)))
@@ -301,10 +284,8 @@ class _Motion:
         return replace(track, state=state, cov=after, n_left_out=(pitch, yaw))
 
 
-def _measurement(posture: Posture | Refusal) -> tuple[FloatArray, FloatArray] | None:
+def _measurement(posture: Posture) -> tuple[FloatArray, FloatArray] | None:
     """Return (range, pitch, yaw) and their covariance, None where there is nothing to use."""
-    if not isinstance(posture, Posture):
-        return None
     measured = np.array([posture.range, posture.pitch, posture.yaw])
     cov = 0.5 * (posture.covariance + posture.covariance.T) + _MIN_VARIANCE
     if not (np.isfinite(measured).all() and np.isfinite(cov).all()):

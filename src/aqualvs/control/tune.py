@@ -26,7 +26,7 @@ of a loop from instability, among them the delay and the gain that may still be 
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -110,31 +110,18 @@ def _thrust_map(model: VehicleModel) -> ThrustMap:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Turning:
-    """Lag of a vehicle's own autopilot behind a turning rate, in seconds.
+def turning_lag(model: VehicleModel, slower: float = 1.0) -> float:
+    """Return how late a model's autopilot follows a turning rate, in seconds.
 
-    The shaping of the stick, the thrusters' lag, and the rate loop: inertia over the moment that it
-    gives for a rate.
+    By the shaping of the stick, the thrusters' lag, and the rate loop, which may be slower by a
+    factor: inertia over the moment that it gives for a rate.
     """
-
-    shaping: float
-    thrusters: float
-    rate_loop: float
-
-    def lag(self, slower: float = 1.0) -> float:
-        """Return the total lag, with a rate loop that is slower by a factor."""
-        return self.shaping + self.thrusters + slower * self.rate_loop
-
-
-def turning_of(model: VehicleModel) -> Turning:
-    """Return how late a model's autopilot follows a turning rate."""
     curve = model.curve
     lever = float(np.abs(model.allocation()[5] @ model.mixing()[:, YAW]))
     each = 0.5 * (curve.forward + curve.reverse) * curve.linear / (1.0 - curve.dead_band)
     inertia = model.inertia[2] + model.added_mass[5]
     rate_loop = inertia / (model.autopilot.rate[2] * lever * each)
-    return Turning(model.autopilot.input_time, curve.lag, rate_loop)
+    return model.autopilot.input_time + curve.lag + slower * rate_loop
 
 
 def tidy(value: float) -> float:
@@ -156,8 +143,7 @@ class Loop:
     # Coefficients, highest power first.
     above: FloatArray
     below: FloatArray
-    # In seconds.
-    delay: float
+    delay: float  # In seconds.
 
     def at(self, omega: FloatArray) -> ComplexArray:
         """Return the response at frequencies in rad/s, shape (N,)."""
@@ -183,12 +169,9 @@ class Margins:
     stable: bool  # The others mean nothing where it is False.
     # Highest frequency at which the loop's gain is 1, in rad/s; NaN if there is none.
     crossover: float
-    # Least phase that may still be lost at such a frequency, in radians.
-    phase: float
-    # Factor by which the gain may grow.
-    gain: float
-    # That may be added, in seconds.
-    delay: float
+    phase: float  # Least phase that may still be lost at such a frequency, in radians.
+    gain: float  # Factor by which the gain may grow.
+    delay: float  # That may be added, in seconds.
     # Least distance of the loop from -1; 1 / modulus is the greatest amplification of a
     # disturbance.
     modulus: float
@@ -256,21 +239,15 @@ class TuneOptions:
     # By which mass and drag may be off, either way.
     mass_factor: float = 1.2
     drag_factor: float = 2.0
-    # Greatest speed of the water, in m/s.
-    current: float = 0.5
+    current: float = 0.5  # Greatest speed of the water, in m/s.
     # Least distance of the loop from -1 at the usual delay, in the worst corner, where mass, drag
     # and current are off at once.
     least_modulus: float = 0.35
-    # As much at the greatest delay.
-    least_late_modulus: float = 0.2
-    # Of the yaw at the greatest delay; it has less to fight.
-    least_yaw_modulus: float = 0.45
+    least_late_modulus: float = 0.2  # As much at the greatest delay.
+    least_yaw_modulus: float = 0.45  # Of the yaw at the greatest delay; it has less to fight.
 
     def __post_init__(self) -> None:
-        """Refuse impossible values.
-
-        Raises `OptionError` naming the value.
-        """
+        """Raise `OptionError` naming the value that is impossible."""
         # Greatest delays and frame intervals in seconds, and greatest current in m/s.
         max_s, max_current = 60.0, 10.0
         if not 0.0 <= self.delay <= self.greatest_delay <= max_s:
@@ -312,17 +289,24 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     """
     options = options or TuneOptions()
     facts = facts_of(model)
-    lag, turn = model.curve.lag, turning_of(model)
+    lag, turn_lag = model.curve.lag, turning_lag(model)
     usual = options.delay + 0.5 * options.frame
 
     def of_range(k: float) -> RangeGains:
         return _range_gains(k, lag + usual, facts)
 
     def of_yaw(k: float) -> YawGains:
-        return _yaw_gains(k, turn.lag() + usual)
+        return _yaw_gains(k, turn_lag + usual)
+
+    m, d = options.mass_factor, options.drag_factor
+    corners = [*itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))]
 
     def range_worst(of: RangeGains, delay: float) -> Margins:
-        return _range_worst(facts, lag, of, delay, options)
+        whole = delay + 0.5 * options.frame
+        return worst(
+            margins(_range_loop(facts, lag, of, whole, current, mass, drag))
+            for mass, drag, current in corners
+        )
 
     def range_is_enough(k: float) -> bool:
         of = of_range(k)
@@ -333,7 +317,7 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     k1 = _greatest(model.name, range_is_enough)
     kp = _greatest(
         model.name,
-        lambda k: _enough(_yaw_worst(turn, of_yaw(k), options), options.least_yaw_modulus),
+        lambda k: _enough(_yaw_worst(model, of_yaw(k), options), options.least_yaw_modulus),
     )
     gains = ControlGains(vehicle=facts, range=of_range(k1), yaw=of_yaw(kp))
     return Tuned(
@@ -341,8 +325,8 @@ def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
         margins(_range_loop(facts, lag, gains.range, usual, 0.0)),
         range_worst(gains.range, options.delay),
         range_worst(gains.range, options.greatest_delay),
-        margins(_yaw_loop(turn.lag(), gains.yaw, usual)),
-        _yaw_worst(turn, gains.yaw, options),
+        margins(_yaw_loop(turn_lag, gains.yaw, usual)),
+        _yaw_worst(model, gains.yaw, options),
     )
 
 
@@ -439,31 +423,16 @@ def _range_loop(
     return Loop(np.asarray(above, np.float64), below, delay)
 
 
-def _range_worst(
-    facts: VehicleFacts, lag: float, gains: RangeGains, delay: float, options: TuneOptions
-) -> Margins:
-    whole = delay + 0.5 * options.frame
-    return worst(
-        margins(_range_loop(facts, lag, gains, whole, current, mass, drag))
-        for mass, drag, current in _corners(options)
-    )
-
-
-def _corners(options: TuneOptions) -> Iterator[tuple[float, float, float]]:
-    m, d = options.mass_factor, options.drag_factor
-    return itertools.product((1.0 / m, m), (1.0 / d, d), (0.0, options.current))
-
-
 def _yaw_loop(lag: float, gains: YawGains, delay: float) -> Loop:
     above = np.array([gains.proportional, gains.integral])
     return Loop(above, np.array([lag, 1.0, 0.0, 0.0]), delay)
 
 
-def _yaw_worst(turning: Turning, gains: YawGains, options: TuneOptions) -> Margins:
+def _yaw_worst(model: VehicleModel, gains: YawGains, options: TuneOptions) -> Margins:
     # Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
     sluggish = 4.0
     delay = options.greatest_delay + 0.5 * options.frame
-    lags = (turning.lag(slower) for slower in (1.0, sluggish))
+    lags = (turning_lag(model, slower) for slower in (1.0, sluggish))
     return worst(margins(_yaw_loop(lag, gains, delay)) for lag in lags)
 
 

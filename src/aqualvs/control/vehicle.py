@@ -25,12 +25,8 @@ class Setpoint:
 class SetpointHolder:
     """One setpoint for all threads; None until somebody sets it.
 
-    Parameters
-    ----------
-    working_range : (float, float)
-        A range outside of it cannot be measured, so it cannot be held, in metres.
-    followed : bool, optional
-        Whether a controller follows it; else it is only what a pilot steers by.
+    `working_range`: a range outside of it, in metres, cannot be measured, so it cannot be held.
+    `followed`: whether a controller follows it; else it is only what a pilot steers by.
     """
 
     MAX_YAW = math.radians(45.0)
@@ -52,23 +48,19 @@ class SetpointHolder:
 
         Raises `OptionError` if it cannot be held; the one in force stays.
         """
-        if setpoint is not None:
-            self._check(setpoint)
-        with self._lock:
-            self._setpoint = setpoint
-
-    def _check(self, setpoint: Setpoint) -> None:
         near, far = self.working_range
-        if not near <= setpoint.range <= far:
+        if setpoint is not None and not near <= setpoint.range <= far:
             raise OptionError(
                 f"setpoint: range {setpoint.range:g} m is outside the working range; "
                 f"choose {near:.2f} to {far:.2f} m"
             )
-        if not abs(setpoint.yaw) <= self.MAX_YAW:
+        if setpoint is not None and not abs(setpoint.yaw) <= self.MAX_YAW:
             raise OptionError(
                 f"setpoint: yaw {math.degrees(setpoint.yaw):g} deg; choose at most "
                 f"{math.degrees(self.MAX_YAW):.0f} deg to either side"
             )
+        with self._lock:
+            self._setpoint = setpoint
 
 
 def clipped(value: float, most: float = 1.0) -> float:
@@ -132,8 +124,7 @@ class VehicleState:
     heading: float | None = None
     roll: float | None = None
     pitch: float | None = None
-    # Why it seems not to obey; empty if it does, or nothing is known.
-    doubt: str = ""
+    doubt: str = ""  # Why it seems not to obey; empty if it does, or nothing is known.
     # Other sender that speaks as the vehicle, and agrees with it; empty if there is none.
     rival: str = ""
 

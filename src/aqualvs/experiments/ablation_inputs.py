@@ -24,10 +24,10 @@ from aqualvs.experiments.tank import wall_dive
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.rig import Laser, Rig, Window
+from aqualvs.optics.rig import Rig, Window
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE
-from aqualvs.simulation.lasers import LaserSource, default_sources
+from aqualvs.simulation.lasers import default_sources
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import Compression
 
@@ -57,8 +57,7 @@ def _run_video(laboratory: Laboratory) -> ExperimentResult:
 def _variant(laboratory: Laboratory, dive: RenderedDive, name: str, ours: bool = False) -> Variant:
     frames = dive.scenario.n_frames
     rate = 8e-6 * dive.video.stat().st_size * dive.scenario.fps / frames
-    named = Variant(f"{name}, {rate:.1f} Mbit/s", (laboratory.measure(dive),))
-    return replace(named, ours=ours)
+    return Variant(f"{name}, {rate:.1f} Mbit/s", (laboratory.measure(dive),), ours)
 
 
 VIDEO = Experiment(
@@ -116,21 +115,15 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _behind_windows(rig: Rig) -> Rig:
-    sources = default_sources(rig)
-    lasers = tuple(
-        _behind_window(laser, source, np.deg2rad(tilt))
-        for laser, source, tilt in zip(rig.lasers, sources, _TILTS_DEG, strict=True)
-    )
-    return replace(rig, name="windows", lasers=lasers)
-
-
-def _behind_window(laser: Laser, source: LaserSource, tilt: float) -> Laser:
-    normal = source.direction + np.tan(tilt) * laser.plane.normal
-    normal /= np.linalg.norm(normal)
-    # Distance of the window from the source, in metres.
+    # Distance of a window from its source, in metres.
     distance = 0.02
-    face = Plane(normal, float(normal @ source.position) + distance)
-    return replace(laser, window=Window(face, source.position))
+    lasers = []
+    for laser, source, tilt in zip(rig.lasers, default_sources(rig), _TILTS_DEG, strict=True):
+        normal = source.direction + np.tan(np.deg2rad(tilt)) * laser.plane.normal
+        normal /= np.linalg.norm(normal)
+        face = Plane(normal, float(normal @ source.position) + distance)
+        lasers.append(replace(laser, window=Window(face, source.position)))
+    return replace(rig, name="windows", lasers=tuple(lasers))
 
 
 def _with_best_planes(rig: Rig) -> Rig:
@@ -223,13 +216,8 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
             ),
             DataColumns(
                 name="ablation_lens",
-                columns={
-                    "lens_error_mm": np.array(_LENS_STEPS_MM),
-                    **{
-                        f"{name}_range_error_percent": row
-                        for name, row in zip(_AXES, lens, strict=True)
-                    },
-                },
+                columns={"lens_error_mm": np.array(_LENS_STEPS_MM)}
+                | dict(zip((f"{name}_range_error_percent" for name in _AXES), lens, strict=True)),
             ),
         ),
         notes=(
@@ -263,8 +251,7 @@ def _slope(steps: Sequence[float], percent: FloatArray) -> float:
 def _draw_beliefs(figure: Figure, index: FloatArray, lens: FloatArray) -> None:
     left, right = figure.subplots(1, 2)
     left.plot(_INDEX_STEPS, index, ".-", color=BLUE)
-    left.set_xlabel("error of the assumed index")
-    left.set_ylabel("error of the range (%)")
+    left.set(xlabel="error of the assumed index", ylabel="error of the range (%)")
     for row, name, colour in zip(lens, _AXES, _COLOURS, strict=True):
         right.plot(_LENS_STEPS_MM, row, ".-", color=colour, label=name)
     right.set_xlabel("error of the assumed lens position (mm)")

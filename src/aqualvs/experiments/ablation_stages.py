@@ -89,8 +89,7 @@ def _variants(laboratory: Laboratory, dive: RenderedDive, where: str) -> list[Va
     found = [Variant(f"sub-pixel, {where}", (laboratory.measure(dive, ours),), ours=True)]
     for level in _LEVELS:
         options = ScannerOptions(detector=ThresholdOptions(level=level))
-        name = f"threshold {level}, {where}"
-        found.append(Variant(name, (laboratory.measure(dive, options),)))
+        found.append(Variant(f"threshold {level}, {where}", (laboratory.measure(dive, options),)))
     return found
 
 
@@ -307,12 +306,10 @@ def _row(seen: _Seen, k: int, where: str) -> _Row:
 
 def _best(judged: Mapping[_Set, PrecisionRecall]) -> tuple[_Set, PrecisionRecall]:
     """Return the set with the largest recall among those of sufficient precision."""
-
-    def value(item: tuple[_Set, PrecisionRecall]) -> float:
-        precise = not item[1].precision < _MIN_PRECISION
-        return item[1].recall if precise else -1.0
-
-    return max(judged.items(), key=value)
+    return max(
+        judged.items(),
+        key=lambda item: -1.0 if item[1].precision < _MIN_PRECISION else item[1].recall,
+    )
 
 
 def _postures(laboratory: Laboratory, dive: RenderedDive, rows: Sequence[_Row]) -> list[Variant]:

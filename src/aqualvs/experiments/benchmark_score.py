@@ -49,8 +49,7 @@ class FrameAnswers:
     # Shape (N, 3): errors of range in percent of the true one, of pitch and yaw in degrees; NaN
     # without answer or target.
     error: FloatArray
-    # Shape (N, 3): standard deviations that the system states, same units.
-    sigma: FloatArray
+    sigma: FloatArray  # Shape (N, 3): standard deviations that the system states, same units.
 
     @property
     def measurable(self) -> BoolArray:
@@ -120,8 +119,8 @@ def score(frames: FrameAnswers) -> Score:
     n_measurable, n_available = int(measurable.sum()), int((measurable & frames.valid).sum())
     off = np.abs(frames.error[:, 0]) > WRONG_PERCENT
     error, sigma = frames.error[measurable], frames.sigma[measurable]
-    z = [_normalised(error[:, k], sigma[:, k]) for k in range(3)]
-    middle = [_median(sigma[:, k]) for k in range(3)]
+    z_range, z_pitch, z_yaw = map(_normalised, error.T, sigma.T)
+    sigma_range, sigma_pitch, sigma_yaw = map(_median, sigma.T)
     return Score(
         n_frames=len(frames.valid),
         n_measurable=n_measurable,
@@ -133,28 +132,20 @@ def score(frames: FrameAnswers) -> Score:
         n_wrong=int((off & ~empty).sum()),
         n_empty=int(empty.sum()),
         n_false=int((empty & frames.valid).sum()),
-        z_range=z[0],
-        z_pitch=z[1],
-        z_yaw=z[2],
-        sigma_range_percent=middle[0],
-        sigma_pitch_deg=middle[1],
-        sigma_yaw_deg=middle[2],
+        z_range=z_range,
+        z_pitch=z_pitch,
+        z_yaw=z_yaw,
+        sigma_range_percent=sigma_range,
+        sigma_pitch_deg=sigma_pitch,
+        sigma_yaw_deg=sigma_yaw,
     )
 
 
 def bars_against(frames: FrameAnswers, clear: FrameAnswers) -> FloatArray:
-    """Return the ratio of error bars to those of the same frames in clear water.
+    """Return the ratio (N, 3) of error bars to those of the same frames in clear water.
 
-    Parameters
-    ----------
-    frames, clear : FrameAnswers
-        Of the same motion before the same target, frame by frame.
-
-    Returns
-    -------
-    ratios : array, shape (N, 3)
-        Sigma of range (in percent), pitch and yaw over that in clear water; NaN where a frame is
-        not measurable or lacks a sigma.
+    It is that of the sigmas of range (in percent), pitch and yaw; NaN where a frame is not
+    measurable or lacks a sigma. Both are of the same motion before the same target.
     """
     both = frames.measurable & clear.measurable
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -165,10 +156,8 @@ def _spread(errors: FloatArray) -> ErrorSpread:
     sizes = np.abs(errors[np.isfinite(errors)])
     if not len(sizes):
         return ErrorSpread(np.nan, np.nan, np.nan, np.nan)
-    rms = float(np.sqrt(np.mean(sizes**2)))
-    return ErrorSpread(
-        rms, float(np.median(sizes)), float(np.percentile(sizes, 95.0)), float(sizes.max())
-    )
+    rms, p95 = np.sqrt(np.mean(sizes**2)), np.percentile(sizes, 95.0)
+    return ErrorSpread(float(rms), float(np.median(sizes)), float(p95), float(sizes.max()))
 
 
 def _normalised(errors: FloatArray, sigmas: FloatArray) -> float:

@@ -56,8 +56,7 @@ class DiveTruth:
     name: str
     level: str
     frames: IntArray  # Shape (N,): frame numbers, from 0.
-    # Shape (N, 3): range (m), pitch and yaw (deg); NaN without a target.
-    posture: FloatArray
+    posture: FloatArray  # Shape (N, 3): range (m), pitch and yaw (deg); NaN without a target.
     # Shape (N,): number of stripe points on the target that are visible in the picture.
     n_visible: IntArray
 
@@ -94,7 +93,9 @@ def load_set(folder: Path) -> BenchmarkSet:
     Raises `SourceError` if the folder contains no set, or a file of it cannot be read.
     """
     path = folder / SET_FILE
-    content = _read_yaml(path)
+    content = read_yaml(path, "a set that 'aqualvs benchmark -o DIR' wrote", SourceError)
+    if not isinstance(content, dict) or content.get(_VERSION_KEY) != 1:
+        raise SourceError(f"{path}: not a benchmark set of version 1; make the set again")
     try:
         name, checksum = str(content["name"]), str(content["checksum"])
         whole = bool(content["whole"])
@@ -167,13 +168,6 @@ def cell(path: Path, i_row: int, row: dict[str, str | None], column: str) -> flo
         raise SourceError(
             f"{path}: line {i_row + 2}: {column} is {text!r}; write a number or leave it empty"
         ) from None
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    content = read_yaml(path, "a set that 'aqualvs benchmark -o DIR' wrote", SourceError)
-    if not isinstance(content, dict) or content.get(_VERSION_KEY) != 1:
-        raise SourceError(f"{path}: not a benchmark set of version 1; make the set again")
-    return content
 
 
 _README_MD = "README.md"
@@ -261,7 +255,7 @@ def set_facts(dives: Sequence[BenchmarkDive]) -> dict[str, Any]:
     whole = len(dives) == len(benchmark_dives())
     whole &= all(dive.scenario.n_frames == N_FRAMES for dive in dives)
     return {
-        "aqualvs_benchmark": 1,
+        _VERSION_KEY: 1,
         "name": BENCHMARK_NAME,
         "checksum": benchmark_checksum(),
         "whole": whole,

@@ -7,31 +7,28 @@ import contextlib
 import statistics
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TextColumn
 
 from aqualvs.errors import OutputError
 from aqualvs.experiments import experiment as catalogue
 from aqualvs.experiments.experiment import Experiment
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.experiments.page import (
-    FIGURES,
+    FAILURES,
+    FILES,
     FRAME,
     PAGE,
-    RESULTS,
-    SERIES,
-    TIMES,
-    WORK,
     Record,
     is_reproduced,
     read_results,
     save_outcome,
+    with_bar,
     work_folder,
     write_page,
     write_results,
@@ -39,47 +36,18 @@ from aqualvs.experiments.page import (
 from aqualvs.results.files import Claim, writing
 from aqualvs.terminal import Echo, hidden_progress
 
-TYPICAL_S: Mapping[str, float] = {
-    "rig": 2.0,
-    "dome": 9.0,
-    "index": 14.0,
-    "box": 10.0,
-    "mesh": 45.0,
-    "distance": 31.0,
-    "angles": 47.0,
-    "dome-or-not": 14.0,
-    "sea": 32.0,
-    "control": 2.0,
-    "failures": 58.0,
-    "stripes": 1.0,
-    "filters": 1.0,
-    "fits": 1.0,
-    "sheets": 11.0,
-    "beliefs": 2.0,
-    "video": 17.0,
-}
-"""Typical seconds of each experiment; only their ratios matter once some are done."""
-
 
 class TimeLeft:
     """Estimate of the time left, from the durations of the experiments so far.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Experiments to run.
-    now : callable
-        Clock in seconds.
+    `names`: experiments to run. `now`: clock in seconds.
     """
 
     def __init__(self, names: Sequence[str], now: Callable[[], float] = time.monotonic) -> None:
-        # Of an experiment that is not in the table.
-        default_s = 25.0
-        self._to_come = {name: TYPICAL_S.get(name, default_s) for name in names}
+        self._to_come = {name: catalogue.MODULES[name][1] for name in names}
         self._now = now
         # Typical seconds of the running experiment, and of those done.
-        self._running = 0.0
-        self._done = 0.0
+        self._running = self._done = 0.0
         # Clock at the start of all, and of the running experiment.
         self._started = self._began = now()
 
@@ -98,6 +66,11 @@ class TimeLeft:
     def seconds(self) -> float:
         """Estimated seconds left."""
         return self._ahead() * self._pace()
+
+    @property
+    def text(self) -> str:
+        """The same as text."""
+        return time_left_text(self.seconds)
 
     @property
     def share(self) -> float:
@@ -150,16 +123,13 @@ class ExperimentBar:
 
 @contextlib.contextmanager
 def experiment_bar(names: Sequence[str]) -> Iterator[ExperimentBar]:
-    """Show the progress of the experiments, if standard error is a terminal.
-
-    `names`: experiments to run, in their order.
-    """
+    """Show the progress of the experiments `names`, if standard error is a terminal."""
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.fields[frames]}"),
-        _LeftColumn(),
+        TextColumn("{task.fields[left].text}"),
     )
     disable = not console.is_terminal
     with (
@@ -167,15 +137,6 @@ def experiment_bar(names: Sequence[str]) -> Iterator[ExperimentBar]:
         Progress(*columns, console=console, transient=True, disable=disable) as bar,
     ):
         yield ExperimentBar(bar, names)
-
-
-class _LeftColumn(ProgressColumn):
-    """Column of the progress bar with the time left."""
-
-    def render(self, task: Task) -> Text:
-        """Return the time left as text."""
-        left: TimeLeft = task.fields["left"]
-        return Text(time_left_text(left.seconds))
 
 
 def time_left_text(seconds: float) -> str:
@@ -186,8 +147,6 @@ def time_left_text(seconds: float) -> str:
 
 
 Load: TypeAlias = Callable[[str], Experiment]
-
-_FAILURES = "failures"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,8 +172,7 @@ def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.expe
     `OptionError` if a name is not known, `OutputError` if the folder cannot be written.
     """
     names = catalogue.ordered(request.names)
-    written = (PAGE, RESULTS, TIMES, FIGURES, SERIES, WORK, _FAILURES)
-    files = [request.out / name for name in written]
+    files = [request.out / name for name in FILES]
     known = files if is_reproduced(request.out) else []
     claim = Claim("reproduce", files, overwrite=True, known=known)
     with experiment_bar(names) as bar:
@@ -227,10 +185,15 @@ def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.expe
             bar.end()
             write_page(results.in_order(), results.seconds, request.out)
     claim.close()
-    for line in _closing(results, names, request.out):
-        echo(line)
-    exit_failed = 1
-    return exit_failed if any(results.records[name].failure for name in names) else 0
+    records = [results.records[name] for name in names]
+    failed = [record.name for record in records if record.failure]
+    if failed:
+        echo(f"{len(failed)} of {len(names)} experiments failed: {', '.join(failed)}")
+    bars = [bool(row.met) for _, row in with_bar(records)]
+    took = sum(results.seconds[name] for name in names)
+    echo(f"{sum(bars)} of {len(bars)} criteria met, {took:.0f} s")
+    echo(f"page: {request.out / PAGE}")
+    return int(bool(failed))
 
 
 class _Records:
@@ -254,6 +217,7 @@ class _Records:
 
     def _record(self, name: str, load: Load, laboratory: Laboratory) -> Record:
         found: Experiment | None = None
+        kept = self.folder / FAILURES / f"{name}.txt"
         try:
             found = load(name)
             record = save_outcome(found, found.run(laboratory), self.folder)
@@ -261,16 +225,12 @@ class _Records:
             raise
         except Exception as fault:
             # The failure of one experiment must not end the others.
-            self._keep_traceback(name, fault)
+            with writing(kept):
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                kept.write_text("".join(traceback.format_exception(fault)), encoding="utf-8")
             return _failed(name, found, fault)
-        (self.folder / _FAILURES / f"{name}.txt").unlink(missing_ok=True)
+        kept.unlink(missing_ok=True)
         return record
-
-    def _keep_traceback(self, name: str, fault: Exception) -> None:
-        path = self.folder / _FAILURES / f"{name}.txt"
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text("".join(traceback.format_exception(fault)), encoding="utf-8")
 
 
 def _failed(name: str, found: Experiment | None, fault: Exception) -> Record:
@@ -288,23 +248,8 @@ def _line(record: Record, seconds: float) -> str:
     if record.failure:
         return (
             f"{record.name}: failed: {record.failure}; the full traceback is in "
-            f"{_FAILURES}/{record.name}.txt"
+            f"{FAILURES}/{record.name}.txt"
         )
     missed = [finding.what for finding in record.findings if finding.met is False]
     more = f" MISSED: {'; '.join(missed)}." if missed else ""
     return f"{record.name}: {record.sentence}{more} ({seconds:.0f} s)"
-
-
-def _closing(results: _Records, names: Sequence[str], out: Path) -> list[str]:
-    bars = [
-        finding.met
-        for name in names
-        for finding in results.records[name].findings
-        if finding.met is not None
-    ]
-    took = sum(results.seconds[name] for name in names)
-    failed = [name for name in names if results.records[name].failure]
-    lines = [f"{sum(bars)} of {len(bars)} criteria met, {took:.0f} s", f"page: {out / PAGE}"]
-    if failed:
-        lines.insert(0, f"{len(failed)} of {len(names)} experiments failed: {', '.join(failed)}")
-    return lines

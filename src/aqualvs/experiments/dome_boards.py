@@ -19,6 +19,7 @@ from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.experiments.experiment import (
+    Column,
     DataColumns,
     Experiment,
     ExperimentResult,
@@ -220,8 +221,7 @@ def _finite(residuals: Sequence[FloatArray]) -> FloatArray:
 def _series(
     solved: SolvedDome, before: Sequence[FloatArray], after: Sequence[FloatArray]
 ) -> tuple[DataColumns, ...]:
-    names = (*_LENS, *_TURN, *_PLANE)
-    true = rig_numbers(solved.truth)
+    names, true = (*_LENS, *_TURN, *_PLANE), rig_numbers(solved.truth)
     parameters = DataColumns(
         name="parameters",
         columns={
@@ -233,19 +233,12 @@ def _series(
     )
     pixels = np.concatenate([fit.view.pixels for fit in solved.dome.views])
     first, last = np.concatenate(before), np.concatenate(after)
-    corners = DataColumns(
-        name="corners",
-        columns={
-            "board": [fit.label for fit in solved.dome.views for _ in range(len(fit.view))],
-            "x_px": pixels[:, 0],
-            "y_px": pixels[:, 1],
-            "before_dx_px": first[:, 0],
-            "before_dy_px": first[:, 1],
-            "after_dx_px": last[:, 0],
-            "after_dy_px": last[:, 1],
-        },
-    )
-    return parameters, corners
+    corners: dict[str, Column] = {
+        "board": [fit.label for fit in solved.dome.views for _ in range(len(fit.view))]
+    }
+    for name, table in (("{}_px", pixels), ("before_d{}_px", first), ("after_d{}_px", last)):
+        corners |= {name.format(axis): table[:, k] for k, axis in enumerate("xy")}
+    return parameters, DataColumns(name="corners", columns=corners)
 
 
 _BOARDS_CAPTION = (

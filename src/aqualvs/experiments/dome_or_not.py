@@ -71,6 +71,12 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     gains = [refitted[k] / _rms(found, found.dome, k) for k in range(4)]
     worst = float(np.abs(found.percent(found.dome)).max())
     bare = float(np.abs(found.percent(found.bare)).max())
+    tables = {"dome": found.dome, "no_dome": found.bare, "no_dome_refitted": found.refitted}
+    columns = {"true_range_m": found.true} | {
+        f"{way}_{name}_m": table[:, k]
+        for k, name in enumerate((*PICKS, "average"))
+        for way, table in tables.items()
+    }
     return ExperimentResult(
         sentence=f"From {min(PLACES_MM)} to {max(PLACES_MM)} mm and back single points are within "
         f"{worst:.2f} % of the truth with the dome model and within {bare:.1f} % without: "
@@ -122,7 +128,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
                 lambda figure: _draw_errors(figure, found),
             ),
         ),
-        series=(_series(found),),
+        series=(DataColumns(name="dome_or_not", columns=columns),),
         notes=(
             "Without the dome model means as with `aqualvs run --no-dome`: the same lens in the "
             "same position, the same laser planes, and straight rays.",
@@ -144,14 +150,7 @@ def level_laser(rig: Rig) -> int:
 def distances(measured: MeasuredDive, rig: Rig, laser: int) -> Distances:
     """Return the distances of a wall that is square to the vehicle, from one laser's stripe.
 
-    Parameters
-    ----------
-    measured : MeasuredDive
-        Measured with the dome model.
-    rig : Rig
-        Rig of the measurement.
-    laser : int
-        Index of the laser.
+    `measured`: by `rig`, with the dome model. `laser`: index of the laser.
     """
     rows = []
     for scan, truth in zip(measured.scans, measured.truth[:, 0], strict=True):
@@ -218,15 +217,6 @@ def _row(found: Distances, pick: int, name: str) -> ExperimentRow:
         ours=f"{_rms(found, found.dome, pick):.3f}, {_rms(found, found.bare, pick):.2f}; "
         f"{slope:.5f}, {bare:.4f}",
     )
-
-
-def _series(found: Distances) -> DataColumns:
-    columns = {"true_range_m": found.true}
-    for k, name in enumerate((*PICKS, "average")):
-        columns[f"dome_{name}_m"] = found.dome[:, k]
-        columns[f"no_dome_{name}_m"] = found.bare[:, k]
-        columns[f"no_dome_refitted_{name}_m"] = found.refitted[:, k]
-    return DataColumns(name="dome_or_not", columns=columns)
 
 
 def _draw_distances(figure: Figure, found: Distances) -> None:

@@ -10,6 +10,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, Self, TypeAlias
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from aqualvs.errors import OptionError
@@ -114,30 +115,45 @@ def drawn(
     return ExperimentFigure(name=name, caption=caption, figure=figure)
 
 
-_PACKAGE = "aqualvs.experiments"
+def draw_dots(
+    axes: Axes,
+    x: FloatArray,
+    y: FloatArray,
+    bars: FloatArray,
+    colour: str,
+    *,
+    bar_width: float = 0.6,
+    label: str | None = None,
+) -> None:
+    """Draw a dot with an error bar for each frame."""
+    axes.errorbar(
+        x, y, bars, fmt=".", color=colour, markersize=3.5, elinewidth=bar_width, label=label
+    )
 
-MODULES: Mapping[str, str] = MappingProxyType(
+
+MODULES: Mapping[str, tuple[str, float]] = MappingProxyType(
     {
-        "rig": "rig_table:EXPERIMENT",
-        "dome": "dome_boards:EXPERIMENT",
-        "index": "water_index:EXPERIMENT",
-        "box": "laser_box:EXPERIMENT",
-        "mesh": "mesh_filter:EXPERIMENT",
-        "distance": "tank:DISTANCE",
-        "angles": "tank:ANGLES",
-        "dome-or-not": "dome_or_not:EXPERIMENT",
-        "sea": "sea:SEA",
-        "control": "sea:CONTROL",
-        "failures": "growth_and_sun:EXPERIMENT",
-        "stripes": "ablation_stages:STRIPES",
-        "filters": "ablation_stages:FILTERS",
-        "fits": "ablation_stages:FITS",
-        "sheets": "ablation_inputs:SHEETS",
-        "beliefs": "ablation_inputs:BELIEFS",
-        "video": "ablation_inputs:VIDEO",
+        "rig": ("rig_table:EXPERIMENT", 2.0),
+        "dome": ("dome_boards:EXPERIMENT", 9.0),
+        "index": ("water_index:EXPERIMENT", 14.0),
+        "box": ("laser_box:EXPERIMENT", 10.0),
+        "mesh": ("mesh_filter:EXPERIMENT", 45.0),
+        "distance": ("tank:DISTANCE", 31.0),
+        "angles": ("tank:ANGLES", 47.0),
+        "dome-or-not": ("dome_or_not:EXPERIMENT", 14.0),
+        "sea": ("sea:SEA", 32.0),
+        "control": ("sea:CONTROL", 2.0),
+        "failures": ("growth_and_sun:EXPERIMENT", 58.0),
+        "stripes": ("ablation_stages:STRIPES", 1.0),
+        "filters": ("ablation_stages:FILTERS", 1.0),
+        "fits": ("ablation_stages:FITS", 1.0),
+        "sheets": ("ablation_inputs:SHEETS", 11.0),
+        "beliefs": ("ablation_inputs:BELIEFS", 2.0),
+        "video": ("ablation_inputs:VIDEO", 17.0),
     }
 )
-"""By name: module and constant of each experiment."""
+"""By name: module and constant of each experiment, and its typical seconds, of which only ratios
+matter once some are done."""
 
 
 def ordered(names: Sequence[str]) -> list[str]:
@@ -153,6 +169,6 @@ def ordered(names: Sequence[str]) -> list[str]:
 
 def experiment(name: str) -> Experiment:
     """Return an experiment of the catalogue."""
-    module, constant = MODULES[name].split(":")
-    found: Experiment = getattr(import_module(f"{_PACKAGE}.{module}"), constant)
+    module, constant = MODULES[name][0].split(":")
+    found: Experiment = getattr(import_module(f"aqualvs.experiments.{module}"), constant)
     return found

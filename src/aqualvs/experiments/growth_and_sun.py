@@ -17,6 +17,7 @@ from aqualvs.experiments.experiment import (
     Experiment,
     ExperimentResult,
     ExperimentRow,
+    draw_dots,
     drawn,
     listed,
 )
@@ -138,7 +139,11 @@ def scene(name: str) -> Scenario:
 
 
 def _run(laboratory: Laboratory) -> ExperimentResult:
-    seen = {name: _seen(laboratory, name) for name in _SCENES}
+    seen = {}
+    for name in _SCENES:
+        dive = laboratory.dive(scene(name))
+        ours, papers_way = laboratory.measure(dive), laboratory.measure(dive, PAPERS_WAY)
+        seen[name] = MeasuredScene(dive, ours, papers_way, visible_points(laboratory, dive))
     valid = {name: one.valid_percent(one.ours) for name, one in seen.items()}
     papers = {name: one.valid_percent(one.papers) for name, one in seen.items()}
     return ExperimentResult(
@@ -163,16 +168,6 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "Errors are relative to the plane through the lit points: growth stands out from the "
             "net, and the lasers measure to it.",
         ),
-    )
-
-
-def _seen(laboratory: Laboratory, name: str) -> MeasuredScene:
-    dive = laboratory.dive(scene(name))
-    return MeasuredScene(
-        dive,
-        laboratory.measure(dive),
-        laboratory.measure(dive, PAPERS_WAY),
-        visible_points(laboratory, dive),
     )
 
 
@@ -225,15 +220,7 @@ def _draw(figure: Figure, seen: Mapping[str, MeasuredScene]) -> None:
         values = (one.ours.range_percent, degrees)
         for axes, value, bar in zip(errors, values, bars, strict=True):
             axes.axhline(0.0, color="#8a8f98", linewidth=0.7)
-            axes.errorbar(
-                one.ours.time_s,
-                value,
-                yerr=bar,
-                fmt=".",
-                color=_COLOURS[name],
-                markersize=3.5,
-                elinewidth=0.6,
-            )
+            draw_dots(axes, one.ours.time_s, value, bar, _COLOURS[name])
         errors[-1].set_xlabel("time (s)")
     grid[1, 0].set_ylabel("range error (%)")
     grid[2, 0].set_ylabel("yaw error (degrees)")

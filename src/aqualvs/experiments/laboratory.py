@@ -53,8 +53,7 @@ class RenderedDive:
     name: str
     # With `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the requested frames.
     folder: Path
-    # True rig.
-    rig: Rig
+    rig: Rig  # True rig.
 
     scenario: Scenario
 
@@ -74,8 +73,7 @@ class MeasuredDive:
     """Dive measured by one scanner, N frames, with the truth."""
 
     scans: list[Scan]
-    # Shape (N, 3): range in m, pitch and yaw in radians; NaN if unknown.
-    truth: FloatArray
+    truth: FloatArray  # Shape (N, 3): range in m, pitch and yaw in radians; NaN if unknown.
 
     @property
     def time_s(self) -> FloatArray:
@@ -96,17 +94,15 @@ class MeasuredDive:
     def values(self) -> FloatArray:
         """Range (m), pitch and yaw (rad) of each frame, NaN where refused; shape (N, 3)."""
         nothing = (np.nan,) * 3
-        return np.array(
-            [nothing if p is None else (p.range, p.pitch, p.yaw) for p in self.postures]
-        ).reshape(-1, 3)
+        rows = [nothing if p is None else (p.range, p.pitch, p.yaw) for p in self.postures]
+        return np.array(rows).reshape(-1, 3)
 
     @property
     def sigmas(self) -> FloatArray:
         """One standard deviation of `values`, shape (N, 3)."""
-        variances = [
-            np.full(3, np.nan) if p is None else np.diag(p.covariance) for p in self.postures
-        ]
-        return np.asarray(np.sqrt(np.array(variances).reshape(-1, 3)))
+        nothing = np.full(3, np.nan)
+        rows = [nothing if p is None else np.diag(p.covariance) for p in self.postures]
+        return np.asarray(np.sqrt(np.array(rows).reshape(-1, 3)))
 
     def columns(self, k: int) -> dict[str, FloatArray]:
         """Return truth, value and sigma of range (0), pitch (1) or yaw (2) as columns."""
@@ -133,23 +129,15 @@ class MeasuredDive:
 class Laboratory:
     """Simulated tank that renders dives and measures them; repeated calls reuse the results.
 
-    Parameters
-    ----------
-    work : Path
-        Folder for the dives, which later runs reuse.
-    tick : callable, optional
-        Called with the number of frames rendered since the last call.
-
-    Attributes
-    ----------
-    frame_s : list of float
-        Seconds of the scanner for each frame measured with its default options.
+    `work`: folder for the dives, which later runs reuse. `tick`: called with the number of frames
+    rendered since the last call.
     """
 
     def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:
         self._work = work
         self._tick = tick or (lambda _n: None)
         self._measured: dict[tuple[str, str], MeasuredDive] = {}
+        # Seconds of the scanner for each frame measured with its default options.
         self.frame_s: list[float] = []
 
     @cached_property
@@ -175,16 +163,10 @@ class Laboratory:
         recording: Compression | None = None,
         point_frames: tuple[int, ...] = (),
     ) -> RenderedDive:
-        """Return a dive with its truth; render it on the first call.
+        """Return a dive with its truth, by default with `self.rig`; render it on the first call.
 
-        Parameters
-        ----------
-        scenario : Scenario
-            The folder is named by its name and a digest of everything that affects the pictures.
-        rig : Rig, optional
-            `self.rig` by default.
-        recording, point_frames
-            As in `simulate_dive`.
+        The folder is named by the scenario and a digest of everything that affects the pictures.
+        `recording` and `point_frames` are those of `simulate_dive`.
         """
         rig = rig or self.rig
         facts = {
@@ -192,8 +174,7 @@ class Laboratory:
             "rig": rig_to_mapping(rig),
             "video": [repr(recording or Compression()), list(point_frames)],
         }
-        digest = _digest(facts)
-        folder = self._work / "dives" / f"{scenario.name}-{digest}"
+        folder = self._work / "dives" / f"{scenario.name}-{_digest(facts)}"
         if not (folder / _READY).exists():
             simulate_dive(
                 scenario,
@@ -279,30 +260,9 @@ class Variant:
         return np.asarray(np.sqrt(np.mean(found**2, axis=0))) if len(found) else np.full(3, np.nan)
 
 
-def findings(variants: Sequence[Variant]) -> tuple[ExperimentRow, ...]:
-    """Return a row for each variant: root mean square errors, and frames with a posture."""
-    return tuple(
-        ExperimentRow(
-            what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
-            ours=f"{numbers_text(one.rms)}; {one.valid_percent:.0f} %",
-        )
-        for one in variants
-    )
-
-
 def numbers_text(values: Sequence[float] | FloatArray) -> str:
     """Return numbers for a table, with a dash for those that are not finite."""
     return ", ".join("-" if not np.isfinite(x) else f"{x:.3g}" for x in values)
-
-
-def series(name: str, variants: Sequence[Variant]) -> DataColumns:
-    """Return the data of `variants_picture`."""
-    rms = np.array([one.rms for one in variants])
-    columns: dict[str, FloatArray | list[str]] = {"variant": [one.name for one in variants]}
-    for k, what in enumerate(("rms_range_percent", "rms_pitch_deg", "rms_yaw_deg")):
-        columns[what] = rms[:, k]
-    columns["valid_percent"] = np.array([one.valid_percent for one in variants])
-    return DataColumns(name=name, columns=columns)
 
 
 def variants_picture(name: str, caption: str, variants: Sequence[Variant]) -> ExperimentFigure:
@@ -312,7 +272,6 @@ def variants_picture(name: str, caption: str, variants: Sequence[Variant]) -> Ex
 
 
 def _draw_variants(figure: Figure, variants: Sequence[Variant]) -> None:
-    names = [one.name for one in variants]
     rms = np.array([one.rms for one in variants])
     valid = np.array([one.valid_percent for one in variants])
     least = 1e-3
@@ -324,7 +283,7 @@ def _draw_variants(figure: Figure, variants: Sequence[Variant]) -> None:
         axes.set_xlim(0.5 * max(low, least), 4.0 * max(np.nanmax(rms), 2.0 * least))
     _bars(panels[3], variants, valid, "valid frames (%)")
     panels[3].set_xlim(0.0, 125.0)
-    panels[0].set_yticks(range(len(names)), names)
+    panels[0].set_yticks(range(len(variants)), [one.name for one in variants])
     panels[0].invert_yaxis()
     panels[0].set_title("rms error", loc="left")
 
@@ -342,11 +301,23 @@ def compared(
 
     `name` and `caption` are those of the figure; the other parameters are as in `ExperimentResult`.
     """
+    rms = np.array([one.rms for one in variants])
+    columns: dict[str, FloatArray | list[str]] = {"variant": [one.name for one in variants]}
+    for k, what in enumerate(("rms_range_percent", "rms_pitch_deg", "rms_yaw_deg")):
+        columns[what] = rms[:, k]
+    columns["valid_percent"] = np.array([one.valid_percent for one in variants])
+    rows = (
+        ExperimentRow(
+            what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
+            ours=f"{numbers_text(one.rms)}; {one.valid_percent:.0f} %",
+        )
+        for one in variants
+    )
     return ExperimentResult(
         sentence=sentence,
-        findings=(*findings(variants), *more_findings),
+        findings=(*rows, *more_findings),
         pictures=(variants_picture(name, caption, variants),),
-        series=(series(name, variants),),
+        series=(DataColumns(name=name, columns=columns),),
         notes=notes,
     )
 
@@ -360,9 +331,8 @@ def _bars(axes: Axes, variants: Sequence[Variant], values: FloatArray, name: str
         if np.isfinite(value):
             axes.text(value, k, words, va="center", fontsize=7.0)
         else:
-            axes.text(
-                0.5, k, "none", va="center", fontsize=7.0, transform=axes.get_yaxis_transform()
-            )
+            aside = axes.get_yaxis_transform()
+            axes.text(0.5, k, "none", va="center", fontsize=7.0, transform=aside)
     axes.set_xlabel(name)
     axes.grid(visible=False, axis="y")
 
@@ -388,7 +358,9 @@ def calibration_pictures(laboratory: Laboratory) -> CalibrationFiles:
             for name, value in asdict(files).items()
         }
         (folder / _RIG_READY).write_text(json.dumps(stored), encoding="utf-8")
-    return _stored_files(folder)
+    known: dict[str, Any] = json.loads((folder / _RIG_READY).read_text(encoding="utf-8"))
+    paths = {key: folder / one for key, one in known.items() if isinstance(one, str)}
+    return CalibrationFiles(**known | paths)
 
 
 def calibrated_rig(laboratory: Laboratory) -> Rig:
@@ -409,14 +381,6 @@ def rig_without_lasers(laboratory: Laboratory) -> Rig:
     calibrated_rig(laboratory)
     draft = laboratory.folder("calibration") / _DRAFT
     return load_rig(draft, need_lasers=False).in_water(laboratory.rig.n_water)
-
-
-def _stored_files(folder: Path) -> CalibrationFiles:
-    stored: dict[str, Any] = json.loads((folder / _RIG_READY).read_text(encoding="utf-8"))
-    files: dict[str, Any] = {
-        name: folder / value if isinstance(value, str) else value for name, value in stored.items()
-    }
-    return CalibrationFiles(**files)
 
 
 def _calibrate(files: CalibrationFiles, rig: Path, n_lasers: int) -> None:

@@ -117,20 +117,16 @@ def remaining(truth: Rig, found: Rig, ranges: Sequence[float] = _SETUP.ranges) -
     return Remaining(far, read - true, np.array([one.sigma_calibration for one in expected]))
 
 
-def _solve(laboratory: Laboratory) -> LasersResult:
+def _run(laboratory: Laboratory) -> ExperimentResult:
+    truth = laboratory.rig
     files = calibration_pictures(laboratory)
-    return calibrate_lasers(
+    solved = calibrate_lasers(
         picture_paths([files.box]),
         rig_without_lasers(laboratory),
         box=files.box_file,
         medium="air",
-        n_lasers=len(laboratory.rig.lasers),
+        n_lasers=len(truth.lasers),
     )
-
-
-def _run(laboratory: Laboratory) -> ExperimentResult:
-    truth = laboratory.rig
-    solved = _solve(laboratory)
     figures = matched(solved.solution.lasers, truth.lasers)
     errors = [plane_error(f, laser.plane) for f, laser in zip(figures, truth.lasers, strict=True)]
     lasers = tuple(one.laser for one in figures)
@@ -276,8 +272,7 @@ def _draw_errors(axes: Axes, names: Sequence[str], table: FloatArray, title: str
     )
     axes.plot(place + 0.12, table[:, 2], "x", color=PAPER, label="the paper's way")
     axes.set_xticks(place, names)
-    axes.set_xlim(-0.6, len(names) - 0.4)
-    axes.set_ylabel(title)
+    axes.set(xlim=(-0.6, len(names) - 0.4), ylabel=title)
     axes.grid(axis="x", visible=False)
 
 

@@ -52,16 +52,7 @@ def papers_pixels(
     """Return the bright pixels of every frame, marked where the paper's filter keeps them.
 
     The paper divides its picture by hand into one area for each laser; here our assignment of
-    pixels to lasers is used, which is better than such areas.
-
-    Parameters
-    ----------
-    laboratory : Laboratory
-    dive : RenderedDive
-    options : MeshFilterOptions
-        Of the filter.
-    level : int, optional
-        Threshold in grey levels.
+    pixels to lasers is used, which is better than such areas. `level`: threshold in grey levels.
     """
     detector = ThresholdOptions() if level is None else ThresholdOptions(level=level)
     scans = laboratory.measure(dive, ScannerOptions(detector=detector)).scans
@@ -90,8 +81,7 @@ def filtered_points(
 ) -> list[FilteredPeaks]:
     """Return the points of scans, marked where the paper's filter keeps them."""
     camera = rig.camera()
-    laser_bands = plan_bands(rig, camera)
-    papers = PaperFilter(rig, camera, laser_bands, options, every_pixel=every_pixel)
+    papers = PaperFilter(rig, camera, plan_bands(rig, camera), options, every_pixel=every_pixel)
     return [
         papers.apply(scan.points.pixels, scan.points.width, scan.points.laser.astype(np.int64))
         for scan in scans
@@ -143,18 +133,10 @@ def score_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Precis
     """Compare points classified as net with the true points of the same laser.
 
     A point has the class of the nearest true point within 9 px; a true point of the net is found if
-    such a point is within 3 px.
+    such a point is within 3 px. Precision is NaN if no true point is near, recall if there is no
+    net.
 
-    Parameters
-    ----------
-    pixels : array, shape (N, 2)
-    laser : int array, shape (N,)
-    truth : LitTruth
-
-    Returns
-    -------
-    PrecisionRecall
-        Precision is NaN if no true point is near, recall if there is no net.
+    `pixels`, shape (N, 2), with the index of their `laser`, shape (N,).
     """
     right = judged = found = true = 0
     for one in np.unique(truth.laser):
@@ -180,18 +162,9 @@ def score_reflections(found: FilteredPeaks, truth: LitTruth) -> PrecisionRecall:
     than half of its pixels are. Its true class is that of most of its pixels, each by the nearest
     true point within 9 px. A true reflection is a group of true points of one laser on the net, at
     most 6 px from one to the next; it is found if pixels of reflections classified as net are
-    within 3 px of more than half of its points.
+    within 3 px of more than half of its points. NaN as of `score_pixels`.
 
-    Parameters
-    ----------
-    found : FilteredPeaks
-        All pixels of the frame, with the mask of those classified as net.
-    truth : LitTruth
-
-    Returns
-    -------
-    PrecisionRecall
-        As of `score_pixels`.
+    `found`: all pixels of the frame, with the mask of those classified as net.
     """
     right = judged = n_found = n_true = 0
     for one in np.unique(truth.laser):
@@ -250,13 +223,9 @@ def _mostly(holds: BoolArray, group: IntArray, n: int = 0) -> BoolArray:
 
 def mean_score(found: Sequence[PrecisionRecall]) -> PrecisionRecall:
     """Return the mean over frames, without those that are NaN; NaN if all are."""
-    columns = np.array(found, np.float64).reshape(-1, 2)
-    valid = np.isfinite(columns)
-    means = [
-        float(column[here].mean()) if here.any() else np.nan
-        for column, here in zip(columns.T, valid.T, strict=True)
-    ]
-    return PrecisionRecall(*means)
+    columns = np.array(found, np.float64).reshape(-1, 2).T
+    known = (column[np.isfinite(column)] for column in columns)
+    return PrecisionRecall(*(float(one.mean()) if len(one) else np.nan for one in known))
 
 
 # Frames that are evaluated.
@@ -361,7 +330,18 @@ def _pictures(
     frame: Frame, scan: Scan, papers: FilteredPeaks, rig: Rig
 ) -> tuple[ExperimentFigure, ...]:
     laser = level_laser(rig)
-    reflections = _reflections(papers, scan, rig, laser)
+    mine = papers.laser == laser
+    reflections = Reflections(
+        frame=scan.index,
+        laser=rig.lasers[laser].name,
+        in_laser=_in_laser(papers.points_in_dome[mine], rig, laser),
+        offset=rig.lasers[laser].plane.offset,
+        working_range=rig.working_range,
+        usable=_in_range(papers.points_in_dome[mine], rig),
+        adaptive=np.zeros(int(mine.sum()), np.bool_),
+        paper=papers.on_mesh[mine],
+        every_pixel=True,
+    )
     planes = draw_figures(reflections, MeshFilterOptions())
     return (
         drawn(
@@ -391,21 +371,10 @@ def _pictures(
     )
 
 
-def _reflections(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> Reflections:
-    mine = papers.laser == laser
+def _in_range(points_in_dome: FloatArray, rig: Rig) -> BoolArray:
     near, far = rig.working_range
-    distance = np.linalg.norm(papers.points_in_dome[mine], axis=1)
-    return Reflections(
-        frame=scan.index,
-        laser=rig.lasers[laser].name,
-        in_laser=_in_laser(papers.points_in_dome[mine], rig, laser),
-        offset=rig.lasers[laser].plane.offset,
-        working_range=rig.working_range,
-        usable=(distance >= near) & (distance <= far),
-        adaptive=np.zeros(int(mine.sum()), np.bool_),
-        paper=papers.on_mesh[mine],
-        every_pixel=True,
-    )
+    distance = np.linalg.norm(points_in_dome, axis=1)
+    return np.asarray((distance >= near) & (distance <= far))
 
 
 def _in_laser(points_in_dome: FloatArray, rig: Rig, laser: int) -> FloatArray:
@@ -434,16 +403,13 @@ def _draw_filtered(figure: Figure, papers: FilteredPeaks, scan: Scan, rig: Rig, 
     for axes, (points, net), name in zip(
         figure.subplots(1, 2, sharex=True, sharey=True), columns, names, strict=True
     ):
-        near, far = rig.working_range
-        distance = np.linalg.norm(points, axis=1)
-        usable = (distance >= near) & (distance <= far)
+        usable = _in_range(points, rig)
         xy, net = 1e3 * _in_laser(points[usable], rig, laser), net[usable]
         axes.plot(*xy.T, ".", color=PINK, markersize=2.0, label=f"all ({len(xy)})")
         kept = xy[net]
         axes.plot(*kept.T, ".", color=OURS, markersize=2.0, label=f"net ({len(kept)})")
         axes.set_title(name, loc="left")
-        axes.set_xlabel("x in the laser's plane (mm)")
-        axes.set_aspect("equal")
+        axes.set(xlabel="x in the laser's plane (mm)", aspect="equal")
         axes.legend(loc="upper left", markerscale=3.0)
         axes.margins(x=0.06, y=0.5)
     figure.axes[0].set_ylabel("y, forward (mm)")

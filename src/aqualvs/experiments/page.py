@@ -24,8 +24,6 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +44,9 @@ from aqualvs.report.html import Card
 from aqualvs.results.files import writing
 
 RESULTS, TIMES, FIGURES, SERIES, WORK = "results.json", "times.json", "figures", "series", "work"
+PAGE, FAILURES = "reproduce.html", "failures"
+FILES = (PAGE, RESULTS, TIMES, FIGURES, SERIES, WORK, FAILURES)
+"""All files and folders that the command writes into its folder."""
 DOI = "10.3390/robotics10040126"
 
 _FORMATS: Mapping[str, Mapping[str, str | None]] = {
@@ -157,32 +158,23 @@ def work_folder(folder: Path) -> Path:
 def sources_digest() -> str:
     """Return a digest of the package's sources, which identifies the version."""
     digest = hashlib.sha256(__version__.encode())
-    for name, source in sorted(_sources(files("aqualvs"), ""), key=lambda one: one[0]):
+    package = Path(__file__).parents[1]
+    sources = [path for path in package.rglob("*") if path.suffix in (".py", ".yaml")]
+    names = {f"/{path.relative_to(package).as_posix()}": path for path in sources}
+    for name, path in sorted(names.items()):
         digest.update(name.encode())
-        digest.update(source.read_bytes())
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def _sources(folder: Traversable, above: str) -> list[tuple[str, Traversable]]:
-    found = []
-    for entry in folder.iterdir():
-        name = f"{above}/{entry.name}"
-        if entry.is_dir():
-            found.extend(_sources(entry, name))
-        elif name.endswith((".py", ".yaml")):
-            found.append((name, entry))
-    return found
-
-
 def _record(content: Mapping[str, Any]) -> Record:
-    texts = {key: str(content[key]) for key in ("name", "title", "paper", "about", "sentence")}
+    texts = ("name", "title", "paper", "about", "sentence", "failure")
     return Record(
-        **texts,
+        **{key: str(content[key]) for key in texts},
         findings=tuple(ExperimentRow(**one) for one in content["findings"]),
         pictures=tuple(PrintedFigure(**one) for one in content["pictures"]),
         series=tuple(content["series"]),
         notes=tuple(content["notes"]),
-        failure=str(content["failure"]),
     )
 
 
@@ -228,7 +220,6 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
         path.write_text(text, encoding="utf-8", errors="replace")
 
 
-PAGE = "reproduce.html"
 FRAME = "a frame"
 """Key of the scanner's median time for one frame among the durations."""
 
@@ -264,7 +255,7 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
         "results": RESULTS,
         "records": records,
         "times": {name: duration(seconds[name]) for name in seconds},
-        "with_bar": _with_bar(records),
+        "with_bar": with_bar(records),
         "bar_text": _bar_text,
         "picture": lambda printed: _picture(printed, folder),
         "cards": html.cards(_cards(records, seconds)),
@@ -274,7 +265,7 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
 
 
 def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[Card]:
-    bars = [finding.met for _, finding in _with_bar(records)]
+    bars = [finding.met for _, finding in with_bar(records)]
     done = sum(not record.failure for record in records)
     took = sum(seconds.get(record.name, 0.0) for record in records)
     yield Card("bars met", f"{sum(map(bool, bars))} of {len(bars)}", "our criterion")
@@ -290,13 +281,14 @@ def _notice(records: Sequence[Record]) -> str:
     lines = [f"{record.name} failed: {record.failure}" for record in records if record.failure]
     lines += [
         f"{record.name}: {finding.what}: {finding.ours}, bar {_bar_text(finding.bar)}"
-        for record, finding in _with_bar(records)
+        for record, finding in with_bar(records)
         if not finding.met
     ]
     return html.notice(lines) if lines else ""
 
 
-def _with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
+def with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
+    """Return the findings that have a criterion, with their records."""
     return [
         (record, finding)
         for record in records
@@ -312,12 +304,11 @@ def _bar_text(bar: str) -> str:
 
 def _picture(printed: PrintedFigure, folder: Path) -> tuple[str, str]:
     """Return a figure as a data URL, and the style with its width."""
-    stem = folder / FIGURES / printed.file
-    drawing = stem.with_name(f"{stem.name}.svg")
+    drawing, pixels = (folder / FIGURES / f"{printed.file}.{kind}" for kind in ("svg", "png"))
     width = f"max-width: {_PX_PER_INCH * printed.width_in:.0f}px"
     if drawing.stat().st_size <= _LARGEST_SVG:
         return html.data_url(drawing.read_bytes(), "svg+xml"), width
-    return html.data_url(stem.with_name(f"{stem.name}.png").read_bytes(), "png"), width
+    return html.data_url(pixels.read_bytes(), "png"), width
 
 
 def duration(seconds: float) -> str:

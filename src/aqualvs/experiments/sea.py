@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from aqualvs.control.gains_file import load_gains
-from aqualvs.control.missions import Guidance, Stage
+from aqualvs.control.missions import Guidance, Mission, Stage
 from aqualvs.control.vehicle import Setpoint, VehicleState
 from aqualvs.experiments.experiment import (
     DataColumns,
@@ -75,8 +75,7 @@ def _run_control(laboratory: Laboratory) -> ExperimentResult:  # noqa: ARG001
 
 def _trials(name: str) -> Trials:
     model = vehicle_model(name)
-    seed = 1
-    return Trials(model, load_gains(model.name), rendered=False, fps=25.0, seed=seed)
+    return Trials(model, load_gains(model.name), seed=1)
 
 
 def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[ExperimentRow, ...]:
@@ -150,13 +149,10 @@ class _Setup(NamedTuple):
 _SETUP = _Setup()
 
 
-class _Descent:
+class _Descent(Mission):
     """Mission that sinks at a constant speed and holds range and yaw."""
 
     sways = False
-
-    def __init__(self, setpoint: Setpoint) -> None:
-        self._setpoint = setpoint
 
     def update(
         self,
@@ -167,10 +163,7 @@ class _Descent:
         """Return the setpoint and the descent; wait without a posture."""
         if posture is None:
             return Guidance(setpoint=None, stage=Stage.WAITING)
-        return Guidance(setpoint=self._setpoint, down=_SETUP.descent, stage=Stage.CHANGING_DEPTH)
-
-    def restart(self) -> None:
-        """Do nothing: no state is kept."""
+        return Guidance(setpoint=self.setpoint, down=_SETUP.descent, stage=Stage.CHANGING_DEPTH)
 
 
 @dataclass(slots=True)
@@ -209,6 +202,9 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
     rms = np.sqrt(np.mean(errors**2, axis=0))
     share = 100.0 * float(valid.mean())
     depth, heading = log.column("depth"), np.unwrap(log.column("heading"))
+    columns = {"time_s": time_s}
+    for k, name in enumerate(("range_m", "pitch_deg", "yaw_deg")):
+        columns |= {f"true_{name}": truth[:, k], name: measured[:, k]}
     return ExperimentResult(
         sentence=f"Sinking from {depth[0]:.1f} to {depth[-1]:.1f} m along a net that moves, range "
         f"is measured within {rms[0]:.2f} % and yaw within {rms[2]:.2f} degrees (rms) in "
@@ -244,7 +240,7 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
                 lambda figure: _draw(figure, log, time_s, measured),
             ),
         ),
-        series=(_sea_series(time_s, measured, truth),),
+        series=(DataColumns(name="sea", columns=columns),),
         notes=(
             "A simulated BlueROV2 in a current of 0.15 m/s and waves of 0.1 m in front of the net "
             "of a cage of 20 m radius that sways and rocks. It is controlled with postures with "
@@ -292,23 +288,13 @@ def _postures(sensor: _PartlyRendered) -> tuple[FloatArray, FloatArray]:
 
     Range in metres, pitch and yaw in degrees.
     """
-    found, true = [], []
-    for _, posture, truth in sensor.seen:
-        if isinstance(posture, Posture):
-            found.append((posture.range, posture.pitch, posture.yaw))
-        else:
-            found.append((math.nan,) * 3)
-        true.append((truth.range, truth.pitch, truth.yaw))
+    found = [
+        (one.range, one.pitch, one.yaw) if isinstance(one, Posture) else (math.nan,) * 3
+        for _, one, _ in sensor.seen
+    ]
+    true = [truth[:3] for _, _, truth in sensor.seen]
     scale = np.array([1.0, 180.0 / math.pi, 180.0 / math.pi])
     return scale * np.array(found), scale * np.array(true)
-
-
-def _sea_series(time_s: FloatArray, measured: FloatArray, truth: FloatArray) -> DataColumns:
-    columns: dict[str, FloatArray] = {"time_s": time_s}
-    for k, name in enumerate(("range_m", "pitch_deg", "yaw_deg")):
-        columns[f"true_{name}"] = truth[:, k]
-        columns[name] = measured[:, k]
-    return DataColumns(name="sea", columns=columns)
 
 
 def _draw(figure: Figure, log: LoopLog, seen_s: FloatArray, measured: FloatArray) -> None:
@@ -326,8 +312,7 @@ def _draw(figure: Figure, log: LoopLog, seen_s: FloatArray, measured: FloatArray
     angles.plot(time_s, np.degrees(log.column("yaw")), color=DARK, alpha=0.5, label="true yaw")
     angles.plot(seen_s, measured[:, 2], ".", color=BLUE, label="measured yaw")
     angles.axhline(0.0, color=GREY, linewidth=0.6)
-    angles.set_ylabel("angle (degrees)")
-    angles.set_xlabel("time (s)")
+    angles.set(ylabel="angle (degrees)", xlabel="time (s)")
     angles.legend(loc="upper right", ncols=3)
     for axes in (ranges, angles):
         low, high = axes.get_ylim()

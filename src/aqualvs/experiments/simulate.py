@@ -168,14 +168,7 @@ def _echo_commands(commands: Iterable[Sequence[str]], echo: Echo) -> None:
 def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
     """Return the arguments of the `aqualvs` commands that calibrate from a simulated set.
 
-    Parameters
-    ----------
-    files : CalibrationFiles
-        Files of the set.
-    out : Path
-        Folder for `rig.yaml` and `run`.
-    n_lasers : int
-        Number of lasers of the rig.
+    `out`: folder for `rig.yaml` and `run`. `n_lasers`: number of lasers of the rig.
     """
     rig = str(out / "rig.yaml")
     update = ["--rig", rig, "-o", rig]

@@ -16,6 +16,7 @@ from aqualvs.experiments.experiment import (
     Experiment,
     ExperimentResult,
     ExperimentRow,
+    draw_dots,
     drawn,
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, calibrated_rig
@@ -129,18 +130,10 @@ def _draw_angle(figure: Figure, measured: MeasuredDive, name: str) -> None:
     top.set_ylabel(f"{name} (degrees)")
     top.legend(("truth", "measured"), loc="upper right")
     low.axhline(0.0, color=GREY, linewidth=0.7)
-    low.errorbar(
-        measured.time_s,
-        _errors_deg(measured, name),
-        yerr=2.0 * np.degrees(measured.sigmas[:, column]),
-        fmt=".",
-        color=OURS,
-        markersize=3.5,
-        elinewidth=0.6,
-    )
-    low.set_ylim(-_SWING.bar_deg, _SWING.bar_deg)
-    low.set_ylabel("error (degrees)")
-    low.set_xlabel("time (s)")
+    bars = 2.0 * np.degrees(measured.sigmas[:, column])
+    draw_dots(low, measured.time_s, _errors_deg(measured, name), bars, OURS)
+    bar = _SWING.bar_deg
+    low.set(ylim=(-bar, bar), ylabel="error (degrees)", xlabel="time (s)")
     figure.align_ylabels((top, low))
 
 
@@ -259,9 +252,7 @@ def _draw_distance(figure: Figure, calibrated: MeasuredDive, true: MeasuredDive)
     right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     for axes in (left, right):
         axes.axhline(0.0, color=DARK, linewidth=0.7)
-        axes.set_xticks(PLACES_MM)
-        axes.set_xlim(345, 688)
-        axes.set_xlabel("true distance (mm)")
+        axes.set(xticks=PLACES_MM, xlim=(345, 688), xlabel="true distance (mm)")
     left.set_ylabel("error of the distance (%)")
 
 
@@ -269,16 +260,7 @@ def _dots(axes: Axes, measured: MeasuredDive, colour: str, label: str, aside_mm:
     """Draw the frames at a distance side by side, so that they can be distinguished."""
     at = 1e3 * measured.truth[:, 0] + aside_mm + _fanned(measured.truth[:, 0])
     bars = 200.0 * measured.sigmas[:, 0] / measured.truth[:, 0]
-    axes.errorbar(
-        at,
-        measured.range_percent,
-        yerr=bars,
-        fmt=".",
-        color=colour,
-        markersize=3.5,
-        elinewidth=0.5,
-        label=label,
-    )
+    draw_dots(axes, at, measured.range_percent, bars, colour, bar_width=0.5, label=label)
 
 
 def _fanned(truth: FloatArray) -> FloatArray:

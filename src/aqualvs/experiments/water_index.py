@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.targets.target_files import load_target
-from aqualvs.calibration.targets.targets import MarkerSet, View
+from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration.water_index.estimator import IndexEstimator, calibrate_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior, IndexStep
 from aqualvs.errors import CalibrationError
@@ -39,21 +39,18 @@ from aqualvs.simulation.panels import PanelRenderer, RoomLight
 from aqualvs.yamlfile import write_text, yaml_text
 
 
-@dataclass(frozen=True, slots=True)
-class IndexSeries:
+class IndexSeries(NamedTuple):
     """Index and its uncertainty after each of F frames, shape (F,) each."""
 
     truth: FloatArray
     # Joint estimate and its standard deviation.
     ours: FloatArray
     sigma: FloatArray
-    # The paper's method: each frame separately, with only the index free.
-    paper: FloatArray
+    paper: FloatArray  # The paper's method: each frame separately, with only the index free.
 
     def after(self, start: int, every: int = 1) -> "IndexSeries":
         """Return frame `start` and every `every`-th one after it."""
-        part = slice(start, None, every)
-        return IndexSeries(self.truth[part], self.ours[part], self.sigma[part], self.paper[part])
+        return IndexSeries(*(column[start::every] for column in self))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +61,7 @@ class Decentred:
     # Standard deviation of the index, for a target position known exactly, and to 0.2 mm and 0.1°.
     noise: FloatArray
     placed: FloatArray
-    # Whether the estimator calls the index observable in the latter case.
-    observable: BoolArray
+    observable: BoolArray  # Whether the estimator calls the index observable in the latter case.
 
 
 def _draw_numbers(figure: Figure, wet: IndexSeries, n_each: int) -> None:
@@ -76,9 +72,8 @@ def _draw_numbers(figure: Figure, wet: IndexSeries, n_each: int) -> None:
         low, high = (wet.ours + k * wet.sigma - minus for k in (-2.0, 2.0))
         axes.fill_between(number, low, high, step="mid", color=OURS, alpha=0.18, linewidth=0.0)
         axes.plot(number, wet.ours - minus, "o", color=OURS, markersize=2.6, label="ours, ± 2 σ")
-        axes.plot(
-            number, wet.paper - minus, "x", color=PAPER, markersize=3.5, label="the paper's way"
-        )
+        papers = wet.paper - minus
+        axes.plot(number, papers, "x", color=PAPER, markersize=3.5, label="the paper's way")
         axes.grid(axis="x", visible=False)
     lower.axhline(0.0, color=TRUTH, linewidth=0.9)
     upper.set(ylabel="index of the water", ylim=(wet.truth.min() - 4e-3, wet.truth.max() + 14e-3))
@@ -118,8 +113,7 @@ class _Setup(NamedTuple):
     # Frames in each medium; a change is accepted at the fourth frame, as a fish may pass.
     frames: int = 10
     fps: float = 5.0
-    # Distance of the target, in metres.
-    plate_far: float = 0.35
+    plate_far: float = 0.35  # Distance of the target, in metres.
     # True pose of the target relative to its file: as far off as the options allow for.
     turn_deg: tuple[float, float, float] = (0.06, -0.11, 0.08)
     shift_mm: tuple[float, float, float] = (0.15, -0.22, 0.12)
@@ -152,7 +146,10 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
     Raises `CalibrationError` if the target is not detected.
     """
     rig = laboratory.rig
-    plate, markers = _plate(laboratory, rig)
+    plate = targets.plate_before(rig, _SETUP.plate_far)
+    path = laboratory.folder("index") / "target.yaml"
+    write_text(path, yaml_text(targets.target_mapping(plate)))
+    markers = load_target(path)
     truly = targets.moved(plate, _out_of_place(plate))
     media = (rig.n_air, *waters)
     rng = np.random.default_rng(_SETUP.seed)
@@ -163,19 +160,14 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
             targets.plate_scene(truly, i, _ROOM), rng
         )
         laboratory.rendered(i, len(media))
-        found = _found(picture, markers, f"picture_{i}")
+        grey = np.asarray(np.rint(picture @ LUMA), np.uint8)
+        found = detect_markers(grey, markers, f"picture_{i}")
+        if isinstance(found, str):
+            raise CalibrationError(f"picture_{i}: {found}")
         for _ in range(_SETUP.frames):
             noise = rng.normal(0.0, _SETUP.corner_px, found.pixels.shape)
             views.append(replace(found, name=f"frame_{len(views)}", pixels=found.pixels + noise))
     return Cruise(views, np.repeat(media, _SETUP.frames), picture)
-
-
-def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]:
-    """Return the plate at its nominal pose, and its markers from its file."""
-    plate = targets.plate_before(rig, _SETUP.plate_far)
-    path = laboratory.folder("index") / "target.yaml"
-    write_text(path, yaml_text(targets.target_mapping(plate)))
-    return plate, load_target(path)
 
 
 def _out_of_place(plate: targets.Marked) -> SE3:
@@ -185,28 +177,10 @@ def _out_of_place(plate: targets.Marked) -> SE3:
     return SE3(rotation, middle - rotation @ middle + 1e-3 * np.array(_SETUP.shift_mm))
 
 
-def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
-    grey = np.asarray(np.rint(picture @ LUMA), np.uint8)
-    view = detect_markers(grey, markers, name)
-    if isinstance(view, str):
-        raise CalibrationError(f"{name}: {view}")
-    return view
-
-
 def follow(rig: Rig, taken: Cruise) -> tuple[IndexSeries, list[IndexStep]]:
-    """Estimate the index frame by frame, by our and by the paper's method.
+    """Estimate the index frame by frame, by our and by the paper's method; return steps, too.
 
-    Parameters
-    ----------
-    rig : Rig
-        Calibrated rig with its covariance.
-    taken : Cruise
-        Frames, beginning in air.
-
-    Returns
-    -------
-    numbers : IndexSeries
-    alarms : list of IndexStep
+    `rig`: calibrated, with its covariance. `taken`: beginning in air.
     """
     estimator = IndexEstimator(
         rig, uncertainty=rig_uncertainty(rig), options=_OPTIONS, prior=IndexPrior.air(rig.n_air)
@@ -355,15 +329,10 @@ def _findings(
 
 
 def _series(numbers: IndexSeries, spread: Decentred) -> tuple[DataColumns, ...]:
+    names = ("n_true", "n_ours", "sigma_ours", "n_paper")
     frames = DataColumns(
         name="frames",
-        columns={
-            "frame": np.arange(len(numbers.truth)),
-            "n_true": numbers.truth,
-            "n_ours": numbers.ours,
-            "sigma_ours": numbers.sigma,
-            "n_paper": numbers.paper,
-        },
+        columns={"frame": np.arange(len(numbers.truth)), **dict(zip(names, numbers, strict=True))},
     )
     lens = DataColumns(
         name="decentred",

@@ -22,12 +22,11 @@ from aqualvs.follow.loop import RangeSensor, SimulatedLink, SimulatedLoop, Timin
 from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.vehicle.models import BLUEROV2, BLUEROV2_HEAVY, VIDEORAY, VehicleModel
+from aqualvs.simulation.vehicle.models import VEHICLES, VehicleModel
 from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 from aqualvs.simulation.vehicle.water_motion import Tether, WaterMotion, Waves
 
 VEHICLE_NAMES = ("bluerov2", "bluerov2-heavy", "videoray")
-_MODELS = dict(zip(VEHICLE_NAMES, (BLUEROV2, BLUEROV2_HEAVY, VIDEORAY), strict=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,14 +40,10 @@ class SimCase:
     # Posture at the start, at rest, in metres and radians.
     start_range: float = 0.6
     start_yaw: float = 0.0
-    # Of the frames.
-    timing: Timing = field(default_factory=Timing)
-    # Latency from sending an effort to its arrival at the vehicle, in seconds.
-    wire: float = 0.02
-    # Of the safety gate.
-    limits: SafetyLimits = field(default_factory=SafetyLimits)
-    # Random seed of the noise of the vehicle's sensors.
-    seed: int = 0
+    timing: Timing = field(default_factory=Timing)  # Of the frames.
+    wire: float = 0.02  # Latency from sending an effort to its arrival at the vehicle, in seconds.
+    limits: SafetyLimits = field(default_factory=SafetyLimits)  # Of the safety gate.
+    seed: int = 0  # Random seed of the noise of the vehicle's sensors.
 
     def loop(self, sensor: RangeSensor, mission: Mission) -> SimulatedLoop:
         """Return the loop, ready to run."""
@@ -71,7 +66,7 @@ def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
     `pilot_gain`: ArduSub's pilot gain, the share of the thrust that a full effort demands. Raises
     `OptionError` if there is no such vehicle, or the gain is out of range.
     """
-    model = _MODELS.get(name.replace("_", "-"))
+    model = VEHICLES.get(name.replace("-", "_"))
     if model is None:
         raise OptionError(f"--vehicle {name}: not known; choose one of {', '.join(VEHICLE_NAMES)}")
     return replace(model, sticks=replace(model.sticks, gain=pilot_gain))
@@ -95,25 +90,11 @@ def sea(
 ) -> WaterMotion:
     """Return a sea with a current, irregular waves and a tether.
 
-    Parameters
-    ----------
-    current : float
-        Speed in m/s.
-    current_to : float
-        Direction of flow, in radians clockwise from the direction of view onto the net (north):
-        0 pushes the vehicle towards the net.
-    wander : float
-        Standard deviation of slow changes of the current, in m/s.
-    waves : float
-        Amplitude at the surface, in metres; 0 for none. The net's origin is 5 m deep.
-    period : float
-        Period of the waves, in seconds.
-    waves_to : float
-        Direction in which the waves travel, as `current_to`.
-    tether : float
-        Length of the tether in the water, in metres.
-    seed : int
-        Random seed of the waves' phases and of the wander.
+    `current`: speed in m/s, in the direction `current_to`, in radians clockwise from that of the
+    view onto the net (north): 0 pushes the vehicle towards the net. `wander`: standard deviation of
+    its slow changes, in m/s. `waves`: amplitude at the surface, in metres, of waves of `period`
+    seconds that travel in the direction `waves_to`; 0 for none. The net's origin is 5 m deep.
+    `tether`: its length in the water, in metres. `seed`: of the waves' phases and the wander.
     """
     flow = (current * math.cos(current_to), current * math.sin(current_to), 0.0)
     swell = Waves(amplitude=waves, period=period, direction=waves_to, n=6) if waves else None
@@ -141,7 +122,6 @@ class Trials:
     rendered: bool = False  # Render and scan pictures; otherwise, sample postures with noise.
     fps: float = 25.0  # Frames a second.
     seed: int = 0  # Random seed of waves and noise.
-    waves: float = 0.1  # Amplitude in metres.
 
     def begin(self, seconds: float) -> LoopLog:
         """Hold the range to a flat net, from rest in the current."""
@@ -177,7 +157,7 @@ class Trials:
         return SimCase(
             model=self.model,
             gains=self.gains,
-            water=sea(waves=self.waves, seed=self.seed),
+            water=sea(seed=self.seed),
             net=net,
             start_range=RANGE,
             timing=Timing(fps=self.fps),

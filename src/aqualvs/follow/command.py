@@ -7,7 +7,7 @@ terminal and ends the run.
 import math
 import time
 from collections import deque
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.follow.log import write_log
 from aqualvs.follow.loop import RangeSensor, SimulatedLoop, Timing
-from aqualvs.follow.report import FIGURE_FILES, PAGE, RunFacts, summary_lines, write_report
+from aqualvs.follow.report import FIGURE_FILES, PAGE, summary_lines, write_report
 from aqualvs.follow.sensor_model import Blind, LossOfSight, RenderedSensor, SampledSensor
 from aqualvs.live.options import Page
 from aqualvs.live.outputs.base import Output
@@ -47,15 +47,8 @@ from aqualvs.terminal import Echo, StopSignals
 class LoopPage:
     """Page that shows a loop step by step, not faster than real time.
 
-    Parameters
-    ----------
-    page : Output
-        The page's server, which `close` closes.
-    rig : Rig
-        Rig of the samples that the page shows.
-    loop : SimulatedLoop
-    holder : SetpointHolder
-        Holder of the setpoint chosen on the page; a hold mission takes it over.
+    `page`: its server. `rig`: of the samples that it shows. `holder`: holds the setpoint chosen on
+    the page; a hold mission takes it over.
     """
 
     def __init__(self, page: Output, rig: Rig, loop: SimulatedLoop, holder: SetpointHolder) -> None:
@@ -117,15 +110,13 @@ class LoopPage:
 
     def _health(self, report: PilotReport) -> Health:
         link = self._loop.link
-        sensor = (
-            "rendered pictures" if isinstance(self._loop.sensor, RenderedSensor) else "no pictures"
-        )
+        kind = "rendered" if isinstance(self._loop.sensor, RenderedSensor) else "no"
         vehicle = f"{report.state.mode_name}, effort forward {report.decision.effort.forward:+.2f}"
         return Health(
             rate_hz=self._loop.timing.fps,
             valid_share=sum(self._valid) / len(self._valid),
             n_frames=report.frame + 1,
-            source=PartHealth("simulation", State.OK, sensor),
+            source=PartHealth("simulation", State.OK, f"{kind} pictures"),
             outputs=(
                 PartHealth("pilot", report.health_state, report.words),
                 PartHealth(link.name, State.OK, vehicle),
@@ -136,17 +127,8 @@ class LoopPage:
 class RunWatch:
     """Callback before each frame that prints events and decides whether to continue.
 
-    Parameters
-    ----------
-    loop : SimulatedLoop
-    seconds : float
-        Duration of the whole run.
-    echo : callable
-        Printer of a line.
-    stop : StopSignals
-        A signal ends the run.
-    slow : bool
-        Whether the run is slow, as with rendering, so that progress is printed.
+    `seconds`: duration of the whole run, which a signal to `stop` ends early. `slow`: whether it is
+    slow, as with rendering, so that progress is printed.
     """
 
     def __init__(
@@ -219,12 +201,9 @@ class SimRequest:
     # Speed in m/s, and direction of flow, in radians clockwise from the direction of view.
     current: float = 0.3
     current_to: float = math.radians(60.0)
-    # Amplitude in metres.
-    waves: float = 0.1
-    # Radius of a round net seen from inside, in metres; 0 for a flat net.
-    cage_radius: float = 0.0
-    # Amplitude of the net's own motion, in metres.
-    net_sway: float = 0.0
+    waves: float = 0.1  # Amplitude in metres.
+    cage_radius: float = 0.0  # Radius of a round net seen from inside, in metres; 0 for a flat net.
+    net_sway: float = 0.0  # Amplitude of the net's own motion, in metres.
 
     seconds: float = 60.0
     fps: float = 25.0  # Frames a second.
@@ -238,16 +217,11 @@ class SimRequest:
     seed: int = 0
     # Time from which on the picture is frozen, in seconds; never if left out.
     freeze: float | None = None
-    # The pilot's page; with it, the run is in real time.
-    page: Page | None = None
-    # Whether to replace earlier output of this command in `out`.
-    overwrite: bool = False
+    page: Page | None = None  # The pilot's page; with it, the run is in real time.
+    overwrite: bool = False  # Whether to replace earlier output of this command in `out`.
 
     def __post_init__(self) -> None:
-        """Refuse requests that cannot be simulated.
-
-        Raises `OptionError` naming the value.
-        """
+        """Raise `OptionError` naming the value if it cannot be simulated."""
         # A second to a day; frame rates of the slowest and the fastest cameras.
         min_s, max_s, min_fps, max_fps = 1.0, 86_400.0, 1.0, 1000.0
         # Metres.
@@ -309,19 +283,16 @@ def run_simulation(request: SimRequest, echo: Echo) -> int:
                 holder = SetpointHolder(rig.working_range)
                 holder.put(setpoint)
                 served = request.page.serve(rig, holder, None, echo, loop.link.state)
-                page = LoopPage(served, rig, loop, holder)
-                stack.callback(page.close)
+                page = stack.enter_context(closing(LoopPage(served, rig, loop, holder)))
             _run(loop, request, page, echo)
         write_log(loop.log, request.out / TRUTH_CSV)
-        facts = RunFacts(
-            vehicle=case.model.name,
-            current=request.current,
-            waves=request.waves,
-            rendered=request.rendered,
-            fps=case.timing.fps,
+        measured = "rendered pictures, measured" if request.rendered else "sampled postures"
+        setup = (
+            f"{case.model.name}, current {request.current:g} m/s, waves of {request.waves:g} m "
+            f"amplitude, {measured} at {case.timing.fps:g} Hz"
         )
-        report = write_report(loop.log, facts, request.out)
-    for line in summary_lines(loop.log, facts):
+        report = write_report(loop.log, setup, request.out)
+    for line in summary_lines(loop.log, setup):
         echo(line)
     echo(f"written: {report}")
     return 0

@@ -27,10 +27,8 @@ class LoopRow(NamedTuple):
     yaw: float
     along: float
     up: float
-    # Least distance between hull and net.
-    clearance: float
-    # Angle between the vehicle's vertical axis and the plumb line.
-    tilt: float
+    clearance: float  # Least distance between hull and net.
+    tilt: float  # Angle between the vehicle's vertical axis and the plumb line.
     # Measured by the lasers in this frame.
     measured_range: float
     measured_pitch: float
@@ -65,8 +63,7 @@ class LoopLog:
     # For each period of more than `NEUTRAL_WITHIN_S` without a valid posture that began with
     # thrust: time from the last valid posture to neutral.
     blind_thrust_s: list[float] = field(default_factory=list)
-    # Number of such periods, with or without thrust.
-    n_blind: int = 0
+    n_blind: int = 0  # Number of such periods, with or without thrust.
 
     # Time from the last valid posture to neutral in the present period; infinite if not reached.
     _neutral_s: float = math.inf
@@ -152,14 +149,10 @@ class HoldMeasures:
     # Rms deviation of the true posture from the setpoint, in metres and radians.
     range_rms: float
     yaw_rms: float
-    # Largest deviation of the range, in metres.
-    range_worst: float
-    # Least distance between hull and net, in metres; negative for contact.
-    min_clearance: float
-    # Frames without a posture.
-    n_lost: int
-    # Frames at which the safety gate changed the effort.
-    n_guarded: int
+    range_worst: float  # Largest deviation of the range, in metres.
+    min_clearance: float  # Least distance between hull and net, in metres; negative for contact.
+    n_lost: int  # Frames without a posture.
+    n_guarded: int  # Frames at which the safety gate changed the effort.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,8 +161,7 @@ class StepMeasures:
 
     # Seconds until the range stays within `SETTLED_SHARE` of the step; infinite if it never does.
     settling: float
-    # Share of the step by which it is exceeded; 0 if it is not.
-    overshoot: float
+    overshoot: float  # Share of the step by which it is exceeded; 0 if it is not.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,12 +184,9 @@ class SafetyMeasures:
     n_blind: int  # Periods of more than `NEUTRAL_WITHIN_S` without a valid posture.
     # Longest time from a last valid posture to neutral, in seconds; 0 without such thrust.
     neutral_late: float
-    # True if oscillations of the range do not grow while the net is in sight.
-    stable: bool
-    # Time at which sight was lost for good; infinite if it was not.
-    lost_s: float
-    # Largest tilt of the vehicle, in radians.
-    greatest_tilt: float
+    stable: bool  # True if oscillations of the range do not grow while the net is in sight.
+    lost_s: float  # Time at which sight was lost for good; infinite if it was not.
+    greatest_tilt: float  # Largest tilt of the vehicle, in radians.
 
     # Share of frames at which efforts reached the vehicle: engaged and not stopped by the gate.
     steered_share: float
@@ -242,15 +231,15 @@ def thruster_measures(log: LoopLog, start_s: float = 0.0) -> EffortMeasures:
     forward effort changes sign with the noise, but no thruster reverses.
     """
     forward, right = log.column("forward"), log.column("right")
-    pairs = [
-        _measured(log, efforts, start_s, math.inf) for efforts in (forward + right, forward - right)
-    ]
+    one, other = (_measured(log, pair, start_s) for pair in (forward + right, forward - right))
     return EffortMeasures(
-        reversals=max(one.reversals for one in pairs), jumps=max(one.jumps for one in pairs)
+        reversals=max(one.reversals, other.reversals), jumps=max(one.jumps, other.jumps)
     )
 
 
-def _measured(log: LoopLog, efforts: FloatArray, start_s: float, end_s: float) -> EffortMeasures:
+def _measured(
+    log: LoopLog, efforts: FloatArray, start_s: float, end_s: float = math.inf
+) -> EffortMeasures:
     here = _between(log, start_s, end_s)
     efforts, time_s = efforts[here], log.column("time_s")[here]
     minutes = max((time_s[-1] - time_s[0]) / 60.0, 1e-9) if len(time_s) else math.inf
@@ -265,14 +254,8 @@ def step_measures(
 ) -> StepMeasures:
     """Return settling time and overshoot of a step.
 
-    Parameters
-    ----------
-    time_s, ranges : array, shape (n,)
-        Times in seconds, and true ranges in metres or their mean over several runs.
-    step_s : float
-        Time at which the setpoint changed.
-    before, after : float
-        Setpoints in metres.
+    `time_s`, `ranges`, shape (n,): times in seconds, and true ranges in metres or their mean over
+    several runs. `step_s`: when the setpoint changed from `before` to `after`, in metres.
     """
     later = time_s > step_s
     share = (ranges[later] - before) / (after - before)

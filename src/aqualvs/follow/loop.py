@@ -10,7 +10,7 @@ is exposed, arrives later, and its effort reaches the vehicle after the latency 
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeAlias
 
 from aqualvs.control.autopilot import Decision, NetPilot, motion_of
@@ -26,10 +26,7 @@ from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 
 
 class SimulatedLink:
-    """Link to a simulated vehicle, in simulated time.
-
-    `vehicle`: its latency is that of the link.
-    """
+    """Link to a simulated vehicle, whose latency is that of the link, in simulated time."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self.vehicle = vehicle
@@ -37,7 +34,6 @@ class SimulatedLink:
         self.effort = NEUTRAL  # Last effort sent.
         self._shaping = shaping_of_model(vehicle.model)
         self._unsent: Effort | None = None
-        self._closed = False
 
     def state(self) -> VehicleState:
         """Return the vehicle's reported state, by the vehicle's clock."""
@@ -56,9 +52,8 @@ class SimulatedLink:
 
     def send(self, effort: Effort) -> None:
         """Send an effort to the vehicle."""
-        if not self._closed:
-            self.effort = effort
-            self._unsent = self._shaping.position(effort)
+        self.effort = effort
+        self._unsent = self._shaping.position(effort)
 
     def pass_time(self, until_s: float) -> None:
         """Simulate the vehicle until a time; do nothing if that has passed."""
@@ -66,11 +61,6 @@ class SimulatedLink:
         if step > 1e-9:
             self.vehicle.step(self._unsent, step)
             self._unsent = None
-
-    def close(self) -> None:
-        """Send neutral; further calls do nothing."""
-        self.send(NEUTRAL)
-        self._closed = True
 
 
 # As in the live run: time after which a silent stream is reported, and periods of further reports
@@ -107,40 +97,10 @@ class _Arrival(NamedTuple):
     posture: Posture | Refusal
 
 
-@dataclass(slots=True)
-class _Sight:
-    """State of the stream in the live run and in the pilot's watchdog."""
-
-    timeout_s: float  # Longest age of a posture for thrust.
-    coming: deque[_Arrival] = field(default_factory=deque)
-    # Arrival of the last frame; last report of a silent stream.
-    heard_s: float = 0.0
-    reported_s: float = -math.inf
-    # Exposure of the last frame.
-    exposed_s: float = 0.0
-    # Arrival of the last valid posture.
-    seen_s: float = -math.inf
-
-    def silence_s(self) -> float:
-        """Return the time of the next report of a silent stream."""
-        return max(self.heard_s + _SILENT_AFTER_S, self.reported_s + _SILENT_EVERY_S)
-
-    def stop_s(self, thrusts: bool) -> float:
-        """Return the time at which the watchdog stops the thrusters; infinite without thrust."""
-        return self.seen_s + self.timeout_s + _WATCHDOG_EVERY_S if thrusts else math.inf
-
-
 class SimulatedLoop:
     """Simulation of a vehicle in front of a net, steered by what its lasers measure.
 
-    Parameters
-    ----------
-    link : SimulatedLink
-    net : NetWall
-    sensor : RangeSensor
-    steering : NetPilot
-        Pilot; it is engaged at the start.
-    timing : Timing, optional
+    `steering`: the pilot, which is engaged at the start.
     """
 
     def __init__(
@@ -157,16 +117,17 @@ class SimulatedLoop:
         # Called after every step of the pilot with the time, the frame's time, the posture or
         # refusal, the decision and the vehicle's state.
         self.on_step: OnStep | None = None
-        self._sight = _Sight(steering.gate.limits.posture_age)
+        # Longest age of a posture for thrust.
+        self._timeout_s = steering.gate.limits.posture_age
+        self._coming: deque[_Arrival] = deque()
+        # Arrival of the last frame; last report of a silent stream.
+        self._heard_s, self._reported_s = 0.0, -math.inf
+        self._exposed_s = 0.0  # Exposure of the last frame.
+        self.seen_s = -math.inf  # Arrival of the last valid posture.
         self._decision: Decision | None = None
         # State of the time filter at the last step; None while it has none.
         self.filtered: FilteredPosture | None = None
         self.log = LoopLog()
-
-    @property
-    def seen_s(self) -> float:
-        """Time of the last valid posture; -inf before the first."""
-        return self._sight.seen_s
 
     def run(self, seconds: float, every_frame: Callable[[float], object] | None = None) -> LoopLog:
         """Simulate and return the log; a further call continues the run.
@@ -200,16 +161,19 @@ class SimulatedLoop:
 
     def _pass_time(self, until_s: float) -> None:
         """Process all events until a time, in their order."""
-        sight = self._sight
         while True:
-            arrives_s = sight.coming[0].at_s if sight.coming else math.inf
-            silence_s, stop_s = sight.silence_s(), sight.stop_s(self.link.effort != NEUTRAL)
+            arrives_s = self._coming[0].at_s if self._coming else math.inf
+            silence_s = max(self._heard_s + _SILENT_AFTER_S, self._reported_s + _SILENT_EVERY_S)
+            # When the watchdog stops the thrusters.
+            stop_s = self.seen_s + self._timeout_s + _WATCHDOG_EVERY_S
+            if self.link.effort == NEUTRAL:
+                stop_s = math.inf
             next_s = min(arrives_s, silence_s, stop_s)
             if next_s > until_s:
                 break
             self.link.pass_time(next_s)
             if arrives_s == next_s:
-                self._receive(sight.coming.popleft())
+                self._receive(self._coming.popleft())
             elif stop_s == next_s:
                 self._send(NEUTRAL, next_s)
             else:
@@ -220,30 +184,27 @@ class SimulatedLoop:
         """Expose a frame, and log the state."""
         posture = self.sensor.look(self.link.vehicle.dome_pose, now_s)
         if posture is not None:
-            coming = self._sight.coming
             wait_s = 0.0 if len(self.log.rows) % 2 else self.timing.field
             at_s = now_s + self.timing.delay + wait_s
             # Both fields of a picture arrive at the same time, up to rounding.
-            at_s = max(at_s, coming[-1].at_s) if coming else at_s
-            coming.append(_Arrival(at_s, now_s, posture))
+            at_s = max(at_s, self._coming[-1].at_s) if self._coming else at_s
+            self._coming.append(_Arrival(at_s, now_s, posture))
         self.log.rows.append(self._row(now_s, posture))
 
     def _receive(self, arrival: _Arrival) -> None:
         """Step the pilot with the posture of a frame."""
-        sight = self._sight
-        sight.heard_s, sight.exposed_s = arrival.at_s, arrival.exposed_s
+        self._heard_s, self._exposed_s = arrival.at_s, arrival.exposed_s
         if arrival.posture:
-            self.log.note_sight(sight.seen_s, arrival.at_s, self.link.effort != NEUTRAL)
-            sight.seen_s = arrival.at_s
+            self.log.note_sight(self.seen_s, arrival.at_s, self.link.effort != NEUTRAL)
+            self.seen_s = arrival.at_s
         self._step(arrival.at_s, arrival.exposed_s, arrival.exposed_s, arrival.posture)
 
     def _report_silence(self, now_s: float) -> None:
         """Step the pilot without a frame."""
-        sight = self._sight
-        sight.reported_s = now_s
-        silent_s = now_s - sight.heard_s
+        self._reported_s = now_s
+        silent_s = now_s - self._heard_s
         refusal = Refusal(Reason.NO_FRAMES, f"no picture for {silent_s:.1f} s")
-        self._step(now_s, sight.exposed_s, sight.exposed_s + silent_s, refusal)
+        self._step(now_s, self._exposed_s, self._exposed_s + silent_s, refusal)
 
     def _step(
         self, now_s: float, frame_s: float, filter_s: float, posture: Posture | Refusal
@@ -260,11 +221,10 @@ class SimulatedLoop:
 
     def _send(self, effort: Effort, now_s: float) -> None:
         """Send an effort, or neutral if the last valid posture is too old."""
-        seen_s = self._sight.seen_s
-        if now_s - seen_s > self._sight.timeout_s:
+        if now_s - self.seen_s > self._timeout_s:
             effort = NEUTRAL
         if effort == NEUTRAL and self.link.effort != NEUTRAL:
-            self.log.note_neutral(seen_s, now_s)
+            self.log.note_neutral(self.seen_s, now_s)
         self.link.send(effort)
 
     def _row(self, now_s: float, posture: Posture | Refusal | None) -> LoopRow:
@@ -278,11 +238,7 @@ class SimulatedLoop:
         effort = self.link.effort
         return LoopRow(
             time_s=now_s,
-            range=truth.range,
-            pitch=truth.pitch,
-            yaw=truth.yaw,
-            along=truth.along,
-            up=truth.up,
+            **truth._asdict(),
             clearance=self.net.clearance(vehicle.pose, vehicle.model.half_size, now_s),
             tilt=math.acos(min(max(float(vehicle.pose.rotation[2, 2]), -1.0), 1.0)),
             measured_range=measured.range if measured else math.nan,

@@ -6,8 +6,6 @@ no display.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
 
 # Shades of frames without a posture, and of those at which the safety gate changed the effort.
 _LOST, _GUARDED = "#f3c9bd", "#f6e3a8"
-_COLOURS = {_LOST: "red", _GUARDED: "yellow"}
 # Least span of an axis, in metres and degrees, so that noise does not fill it.
 _MIN_DEPTH, _MIN_RANGE, _MIN_ANGLE = 0.2, 0.1, 6.0
 
@@ -97,8 +94,7 @@ def _command(axes: "Axes", time_s: FloatArray, effort: FloatArray, name: str) ->
     axes.axhline(0.0, color=GREY, linewidth=0.6)
     axes.plot(time_s, effort, color=DARK, linewidth=0.7)
     most = max(0.2, 1.15 * float(np.abs(effort).max()))
-    axes.set_ylim(-most, most)
-    axes.set_ylabel(name)
+    axes.set(ylim=(-most, most), ylabel=name)
 
 
 def _panels(n: int, height_in: float) -> "tuple[Figure, list[Axes]]":
@@ -132,37 +128,14 @@ def _finish(axes: "list[Axes]", log: LoopLog, time_s: FloatArray) -> None:
             for start, end in runs_of(here):
                 one.axvspan(time_s[start], time_s[end] + step_s, color=colour, linewidth=0)
         one.set_xlim(float(time_s[0]), float(time_s[-1]))
-    notes = [
-        ("no posture", _LOST) if lost.any() else None,
-        ("safety gate", _GUARDED) if guarded.any() else None,
-    ]
-    words = ", ".join(f"{name} shaded {_COLOURS[colour]}" for name, colour in filter(None, notes))
+    notes = (("no posture shaded red", lost), ("safety gate shaded yellow", guarded))
+    words = ", ".join(words for words, here in notes if here.any())
     axes[-1].set_xlabel("time (s)" + (f"   ({words})" if words else ""))
 
 
 PAGE = "follow.html"
 SETTLED_S = 10.0
 """Time, in seconds, from which on errors count: a run begins at rest in moving water."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunFacts:
-    """Setup of the simulation for page and summary; SI units."""
-
-    vehicle: str
-    current: float
-    waves: float
-    rendered: bool
-    fps: float
-
-    @property
-    def words(self) -> str:
-        """The setup in one line."""
-        sensor = "rendered pictures, measured" if self.rendered else "sampled postures"
-        return (
-            f"{self.vehicle}, current {self.current:g} m/s, waves of {self.waves:g} m amplitude, "
-            f"{sensor} at {self.fps:g} Hz"
-        )
 
 
 def summary(log: LoopLog) -> list[tuple[str, str]]:
@@ -233,31 +206,26 @@ def _efforts(log: LoopLog, start_s: float) -> list[tuple[str, str]]:
     ]
 
 
-def summary_lines(log: LoopLog, facts: RunFacts) -> list[str]:
-    """Return the summary as lines for a terminal."""
+def summary_lines(log: LoopLog, setup: str) -> list[str]:
+    """Return the summary as lines for a terminal; `setup` is the first."""
     table = summary(log)
     width = max(len(name) for name, _ in table)
-    return [facts.words, *(f"  {name:<{width}}  {value}" for name, value in table)]
+    return [setup, *(f"  {name:<{width}}  {value}" for name, value in table)]
 
 
-def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
+def write_report(log: LoopLog, setup: str, out: Path) -> Path:
     """Draw the figures, write the page beside them, and return its path.
+
+    `setup`: the setup of the simulation in one line.
 
     Raises `OutputError` if a file cannot be written.
     """
     with writing(out):
         figures = save_figures(drawn_follow_figures(log), out, dpi=160)
-    path = out / PAGE
-    with writing(path):
-        replace_text(path, _page(log, facts, figures))
-    return path
-
-
-def _page(log: LoopLog, facts: RunFacts, figures: Sequence[Path]) -> str:
     cards, warnings = _headline(log)
     content = {
         "title": "Hold and follow, simulated",
-        "subtitle": facts.words,
+        "subtitle": setup,
         "cards": html.cards(cards),
         "warnings": html.notice(warnings),
         "facts": html.fact_table(summary(log)),
@@ -265,7 +233,10 @@ def _page(log: LoopLog, facts: RunFacts, figures: Sequence[Path]) -> str:
             (html.data_url(one.read_bytes(), "png"), _CAPTIONS[one.name]) for one in figures
         ],
     }
-    return html.page("follow.html", content)
+    path = out / PAGE
+    with writing(path):
+        replace_text(path, html.page("follow.html", content))
+    return path
 
 
 _CAPTIONS = {

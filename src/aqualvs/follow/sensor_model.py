@@ -26,12 +26,6 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Net, Scene
 
 
-def net_scene() -> Scene:
-    """Return a diamond net with a little growth, in clear water."""
-    net = Net(bar=0.025, twine=0.0022, fouling=0.1)
-    return Scene(dome_from_scene=SE3.identity(), nets=(net,), target="net")
-
-
 class RenderedSensor:
     """Sensor that renders the camera's picture from a vehicle, and runs the scanner on it.
 
@@ -39,19 +33,9 @@ class RenderedSensor:
     between this frame and the previous one; the frame's time is the end of the readout. Frames of
     an interlaced camera are its single fields.
 
-    Parameters
-    ----------
-    net : NetWall
-    rig : Rig
-        Rig that takes and measures the pictures.
-    rng : Generator
-        Source of the sensor's noise.
-    scene : Scene, optional
-        Scene in the frame of the net at rest; `net_scene` if left out.
-    camera : SimulatedCamera
-        Camera that takes the pictures; its compression is left out.
-    freeze_s : float
-        Time from which on the last picture is repeated, with time stamps that advance.
+    `rig`: takes and measures the pictures. `scene`: in the frame of the net at rest; if left out, a
+    diamond net with a little growth, in clear water. `camera`: its compression is left out.
+    `freeze_s`: time from which on the last picture is repeated, with time stamps that advance.
     """
 
     def __init__(
@@ -65,7 +49,8 @@ class RenderedSensor:
     ) -> None:
         n_kept = 8  # More than the pictures between exposure and pilot.
         self._net, self._rng = net, rng
-        self._scene = net_scene() if scene is None else scene
+        nets = (Net(bar=0.025, twine=0.0022, fouling=0.1),)
+        self._scene = scene or Scene(dome_from_scene=SE3.identity(), nets=nets, target="net")
         self._renderer = Renderer(rig, camera=camera)
         self._scanner = Scanner(rig)
         self._n_frames = 0
@@ -157,23 +142,14 @@ class PostureNoise:
     # In radians.
     pitch: float = math.radians(0.4)
     yaw: float = math.radians(0.4)
-    # Share of frames with ten times that noise, unknown to the scanner.
-    outliers: float = 0.0
+    outliers: float = 0.0  # Share of frames with ten times that noise, unknown to the scanner.
 
 
 class SampledSensor:
     """Sensor that returns the true posture with noise.
 
-    Parameters
-    ----------
-    net : NetWall
-    rng : Generator
-        Source of the noise.
-    noise : PostureNoise, optional
-    blind : sequence of Blind
-        Periods without sight.
-    working_range : (float, float)
-        Range in metres outside which there is no posture.
+    `blind`: periods without sight. `working_range`: range in metres outside which there is no
+    posture.
     """
 
     def __init__(

@@ -37,10 +37,8 @@ class StepOptions:
     # Ranges before and after, in metres.
     begin: float = 0.8
     end: float = 0.6
-    # Delay from a frame to its effort at the vehicle, in seconds.
-    delay: float = 0.1
-    # Seconds between frames.
-    frame: float = 0.04
+    delay: float = 0.1  # Delay from a frame to its effort at the vehicle, in seconds.
+    frame: float = 0.04  # Seconds between frames.
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +48,7 @@ class StepAnswer:
     # Shape (N,): seconds since the step, from before it on; metres.
     time: FloatArray
     range: FloatArray
-    # As a share of the step.
-    overshoot: float
+    overshoot: float  # As a share of the step.
     # Seconds after which the range stays within 5 % of the step; infinite if it does not.
     settling: float
 

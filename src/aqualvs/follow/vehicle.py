@@ -92,8 +92,7 @@ class FollowLogOutput(Output):
 class FollowRequest:
     """Request to steer a vehicle."""
 
-    # Source, rig, page and recordings; postures are smoothed in any case.
-    live: LiveRequest
+    live: LiveRequest  # Source, rig, page and recordings; postures are smoothed in any case.
     mavlink: str  # Address of the vehicle.
     gains: str  # Gains file, or the name of a vehicle whose gains come with the package.
     out: Path  # Folder for the log.

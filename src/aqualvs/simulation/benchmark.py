@@ -29,6 +29,7 @@ from aqualvs.optics.rigfile import rig_to_mapping, save_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.cameras import expose, spread
 from aqualvs.simulation.dive import frames_of_picture
+from aqualvs.simulation.lasers import LUMA
 from aqualvs.simulation.render import Renderer, SceneAt
 from aqualvs.simulation.scenario import Scenario, packaged, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
@@ -44,7 +45,7 @@ VISIBLE_LIMIT = 40
 
 # A stripe is narrower than this share of the picture's width; the glow of the sheets is wider.
 _WIDEST_STRIPE = 1 / 36
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+_LUMA = LUMA.astype(np.float32)
 _BEYOND = 1e6
 
 
@@ -55,14 +56,10 @@ def stripe_contrast(
 
     Parameters
     ----------
-    renderer : Renderer
-        Renderer of the scene.
     scene : Scene
         With its lasers on.
-    t : float
-        Time in seconds.
     radiance : float32 array, shape (height, width, 3)
-        Of that scene at that time, from `Renderer.radiance`.
+        Of that scene at time `t`, from `Renderer.radiance`.
     lit : LitPoints
         Of that scene at that time.
 
@@ -99,25 +96,13 @@ def _above_flanks(
 
 
 def visible_points(lit: LitPoints, label: int, contrast: NDArray[np.float32]) -> IntArray:
-    """Return the indices of lit points that are visible stripe points of a target.
+    """Return the indices of lit points that are visible stripe points of a target, by laser.
 
     A stripe has one point in every pixel along it: in every column if it is rather level, in every
     row if it is rather upright. A point is visible if the contrast at its pixel, or at one beside
     it, reaches `CONTRAST_LIMIT`.
 
-    Parameters
-    ----------
-    lit : LitPoints
-        Of the frame.
-    label : int
-        `SurfaceKind` of the target.
-    contrast : array, shape (height, width)
-        From `stripe_contrast`.
-
-    Returns
-    -------
-    i_points : int array, shape (N,)
-        Indices into `lit`, ordered by laser.
+    `label`: `SurfaceKind` of the target. `contrast`, shape (height, width): of `stripe_contrast`.
     """
     bright = np.asarray(cv2.dilate(contrast, np.ones((3, 3), np.uint8)))
     x, y = _places(lit.pixels, contrast.shape).T
@@ -220,20 +205,16 @@ def _definitions() -> list[tuple[str, str, dict[str, Any]]]:
     parts = packaged("benchmark.yaml")
     for level, courses in parts["levels"].items():
         for course, over in courses.items():
-            content = _laid_over(parts["targets"].get(course, {}), over)
+            base = parts["targets"].get(course, {})
+            content = {**base, **over}
+            if "net" in base and "net" in over:
+                # The net is laid over key by key.
+                content["net"] = {**base["net"], **over["net"]}
             content["motion"] = content.get("motion", parts["courses"].get(course, {}))
             timing = {"duration_s": duration_s, "fps": N_FRAMES / duration_s}
             seed = 1000 + len(found)
             found.append((f"{level}_{course}", level, {**timing, "seed": seed, **content}))
     return found
-
-
-def _laid_over(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return a mapping with another's values over its own; the net is laid over key by key."""
-    merged = {**base, **over}
-    if "net" in base and "net" in over:
-        merged["net"] = {**base["net"], **over["net"]}
-    return merged
 
 
 def _rounded(value: Any) -> Any:
@@ -262,19 +243,9 @@ def render_benchmark_dive(
 ) -> None:
     """Write `dive.mp4`, `truth.csv` and `rig.yaml` into a new or existing folder.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        For `benchmark_rig()`, with any shutter; of an interlaced one each field is a frame.
-    folder : Path
-        Files of the same names in it are replaced.
-    tick : callable
-        Called with 1 after every frame.
-
-    Raises
-    ------
-    OSError, OutputError
-        If the folder or a file cannot be written.
+    `renderer`: for `benchmark_rig()`, with any shutter; of an interlaced one each field is a frame.
+    `tick`: called with 1 after every frame. Raises `OSError` or `OutputError` if the folder or a
+    file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     save_rig(with_exact_numbers(renderer.rig), folder / "rig.yaml")
@@ -357,13 +328,7 @@ def truth_cells(scene: Scene, visible: LitPoints) -> list[Cell]:
 
 
 def _part(lit: LitPoints, points: NDArray[np.int64]) -> LitPoints:
-    return replace(
-        lit,
-        points_in_dome=lit.points_in_dome[points],
-        pixels=lit.pixels[points],
-        laser=lit.laser[points],
-        label=lit.label[points],
-    )
+    return LitPoints(*(getattr(lit, name)[points] for name in LitPoints.__slots__))
 
 
 def _posture(plane: Plane) -> list[Cell]:

@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
@@ -20,7 +19,7 @@ from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.dive import simulate_dive, writable
 from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, panel_sheets
-from aqualvs.simulation.scenario import Scenario, parse_scenario
+from aqualvs.simulation.scenario import parse_scenario
 from aqualvs.simulation.textures import CharucoPrint
 from aqualvs.simulation.video import jpeg
 from aqualvs.yamlfile import write_text, yaml_text
@@ -32,7 +31,6 @@ _WATER = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028
 # The nearest board stands this far before the dome.
 _NEAREST = 0.15
 _PLATE_FAR = 0.35
-_FPS = 25.0
 
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 
@@ -116,7 +114,11 @@ class _Job:
         between_stills_s = 4.0
         for scene, file in zip(scenes, names, strict=True):
             image = renderer.render(scene, rng, between_stills_s * self.done)
-            _write_picture(folder / file, image, quality)
+            if quality is None:
+                data = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+            else:
+                data = jpeg(image, quality)
+            (folder / file).write_bytes(data)
             # Pictures of an earlier set by another camera.
             (folder / file).with_suffix(".png" if quality else ".jpg").unlink(missing_ok=True)
             self.did_one()
@@ -319,25 +321,22 @@ def _index(job: _Job) -> tuple[Path, Path]:
 def _dive(job: _Job) -> tuple[Path | None, Path | None]:
     if not job.size.dive:
         return None, None
+    fps = 25.0
+    content = {
+        "duration_s": job.size.dive / fps,
+        "fps": fps,
+        "seed": job.seed,
+        "motion": {"range_mm": [420, 700], "pitch_deg": [-4, 3], "yaw_deg": [6, -5]},
+        "walls": [{}],
+    }
     files = simulate_dive(
-        _wall_dive(job.size.dive, job.seed),
+        parse_scenario(content, "calibration", "calibration"),
         job.rig,
         job.folder("dive"),
         progress=lambda _done, _all: job.did_one(),
         camera=job.camera,
     )
     return files.video, files.truth
-
-
-def _wall_dive(n_frames: int, seed: int) -> Scenario:
-    content: dict[str, Any] = {
-        "duration_s": n_frames / _FPS,
-        "fps": _FPS,
-        "seed": seed,
-        "motion": {"range_mm": [420, 700], "pitch_deg": [-4, 3], "yaw_deg": [6, -5]},
-        "walls": [{}],
-    }
-    return parse_scenario(content, "calibration", "calibration")
 
 
 def _nominal_mapping(rig: Rig) -> dict[str, Any]:
@@ -362,14 +361,6 @@ def _nominal_mapping(rig: Rig) -> dict[str, Any]:
         lasers["wavelength_nm"] = float(light_nm)
     content |= {"n_air": float(rig.n_air), "lasers": lasers}
     return {**content, "working_range_mm": [targets.to_mm(far) for far in rig.working_range]}
-
-
-def _write_picture(path: Path, image: NDArray[np.uint8], jpeg_quality: int | None) -> None:
-    if jpeg_quality is not None:
-        path.write_bytes(jpeg(image, jpeg_quality))
-        return
-    _, data = cv2.imencode(".png", image[..., ::-1])
-    path.write_bytes(data.tobytes())
 
 
 def _write_poses(path: Path, names: Sequence[str], poses: Sequence[SE3]) -> None:

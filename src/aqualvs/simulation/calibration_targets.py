@@ -4,8 +4,8 @@ The poses are of boards before the bare camera and on a rail before the dome, of
 a box of markers, and of a plate in the view.
 """
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -40,16 +40,7 @@ _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 def board_across(rig: Rig, size: Size, count: int, rng: np.random.Generator) -> list[SE3]:
     """Return `dome_from_board` of a board all over a bare camera's picture, mostly tilted.
 
-    Parameters
-    ----------
-    rig : Rig
-        Its lens and its place; the dome plays no part.
-    size : (float, float)
-        Width and height of the board's squares, in metres.
-    count : int
-        Number of poses.
-    rng : Generator
-        Random number generator.
+    `rig`: the dome plays no part. `size`: width and height of the board's squares, in metres.
     """
     poses = []
     # Widths of the board as shares of the picture's, in turn.
@@ -72,22 +63,11 @@ def board_on_rail(
 ) -> tuple[list[SE3], list[float]]:
     """Return `dome_from_board` of a board that is carried along the dome's y axis.
 
-    Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted.
+    Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted. The
+    second list has the distances along the y axis to each board's plane, in metres.
 
-    Parameters
-    ----------
-    size : (float, float)
-        Width and height of the board's squares, in metres.
-    distances : array, shape (N,)
-        Of the board's middle, in metres.
-    rng : Generator
-        Random number generator.
-
-    Returns
-    -------
-    poses : list of SE3
-    measured : list of float
-        Distance along the y axis to each board's plane, in metres.
+    `size`: width and height of the board's squares, in metres. `distances`, shape (N,): of the
+    board's middle, in metres.
     """
     poses, measured = [], []
     for k, distance in enumerate(distances):
@@ -118,14 +98,8 @@ def vehicle_in_box(count: int, rng: np.random.Generator) -> list[SE3]:
 def plate_in_view(rig: Rig, size: Size, far: float) -> SE3:
     """Return `dome_from_plate` of a plate in the quarter of the view farthest from the lasers.
 
-    Parameters
-    ----------
-    rig : Rig
-        In its water.
-    size : (float, float)
-        Width and height of the plate, in metres.
-    far : float
-        Distance of its middle from the dome's outside, in metres.
+    `rig`: in its water. `size`: width and height of the plate, in metres. `far`: distance of its
+    middle from the dome's outside, in metres.
     """
     turn = rotation_from_rotvec(np.deg2rad([3.0, 1.0, 6.0])) @ DOME_FROM_CAM_NOMINAL
     rays = rig.camera().rays(np.array(_QUARTERS) * rig.size_px - 0.5)
@@ -146,20 +120,6 @@ def _centred(turn: FloatArray, middle: FloatArray, size: Size) -> SE3:
 
 
 FAMILY = "DICT_APRILTAG_36h11"
-
-
-class _PrintOptions(NamedTuple):
-    """Printed targets of rendered pictures: sizes of cells in metres, and their look."""
-
-    # Pictures narrower than this get larger prints, whose markers can still be read.
-    narrow_px: int = 600
-    wall_cell: float = 2e-3
-    plate_cell: float = 1e-3
-    albedo: float = 0.55
-    mottle: float = 0.16
-
-
-_PRINTS = _PrintOptions()
 
 
 _CORNER_ORDER = (
@@ -187,10 +147,16 @@ class Marked:
         return self.panel.dome_from_panel.apply(np.concatenate([flat, depth], axis=-1))
 
 
+def _is_narrow(width_px: int) -> bool:
+    """Return whether a picture needs larger prints, whose markers can still be read."""
+    narrow_px = 600
+    return width_px < narrow_px
+
+
 def hand_board(width_px: int) -> CharucoPrint:
     """Return the board that is held before the bare camera."""
     return CharucoPrint(
-        squares=(11, 8) if width_px >= _PRINTS.narrow_px else (7, 5),
+        squares=(7, 5) if _is_narrow(width_px) else (11, 8),
         square=24e-3,
         marker=18e-3,
         border=12e-3,
@@ -219,14 +185,8 @@ def squares_size(board: CharucoPrint) -> tuple[float, float]:
 def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Panel:
     """Return a large mottled panel to stand behind everything, placed by its middle.
 
-    Parameters
-    ----------
-    dome_from_ground : SE3
-        x to the right, y down.
-    cell : float
-        Side of its 800 x 600 cells, in metres.
-    shift : int
-        Offset in the noise.
+    `dome_from_ground`: x to the right, y down. `cell`: side of its 800 x 600 cells, in metres.
+    `shift`: offset in the noise.
     """
     texture = Texture(mottled((600, 800), 0.26, 0.45, scale=1.6, shift=shift), cell)
     width, height = texture.size
@@ -236,11 +196,10 @@ def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Pane
 
 def marker_box(width_px: int) -> list[Marked]:
     """Return the walls of an open box, 400 x 380 x 700 mm inside, in `box`."""
-    side = 24 if width_px >= _PRINTS.narrow_px else 32
-    # Inside of the box: width, depth, height in cells of its walls.
-    wide, deep, high = 200, 350, 190
-    half_wide, half_high = 0.5 * wide * _PRINTS.wall_cell, 0.5 * high * _PRINTS.wall_cell
-    depth = deep * _PRINTS.wall_cell
+    side = 32 if _is_narrow(width_px) else 24
+    # Inside of the box: width, depth, height in cells of its walls, whose side is in metres.
+    wide, deep, high, cell = 200, 350, 190, 2e-3
+    half_wide, half_high, depth = 0.5 * wide * cell, 0.5 * high * cell, deep * cell
     x, y, z = np.eye(3)
     # Name, cells across and down, top-left corner, directions across and down as seen from inside.
     walls = (
@@ -254,10 +213,9 @@ def marker_box(width_px: int) -> list[Marked]:
         places = grid_corners(*(_places(n, side) for n in cells))
         pose = SE3(np.column_stack([across, down, np.cross(across, down)]), np.array(corner))
         prints = _prints(first, places, side, side // 6)
-        albedo = mottled(cells[::-1], _PRINTS.albedo, _PRINTS.mottle, scale=0.8, shift=97 * k)
-        marked.append(
-            Marked(name, Panel(pose, marker_texture(albedo, _PRINTS.wall_cell, prints)), prints)
-        )
+        plywood = mottled(cells[::-1], albedo=0.55, contrast=0.16, scale=0.8, shift=97 * k)
+        panel = Panel(pose, marker_texture(plywood, cell, prints))
+        marked.append(Marked(name, panel, prints))
         first += len(places)
     return marked
 
@@ -272,12 +230,13 @@ def _places(cells: int, side: int) -> IntArray:
 
 def marker_plate() -> Marked:
     """Return a plate of six markers, in a frame of its own."""
-    side, gap = 24, 6
+    # In cells, whose side is in metres.
+    side, gap, cell = 24, 6, 1e-3
     places = grid_corners(*(gap + (side + gap) * np.arange(n) for n in (3, 2)))
     first_on_plate = 300
     prints = _prints(first_on_plate, places, side, 0)
     paper = np.full((2 * side + 3 * gap, 3 * side + 4 * gap), PAPER)
-    panel = Panel(SE3.identity(), marker_texture(paper, _PRINTS.plate_cell, prints))
+    panel = Panel(SE3.identity(), marker_texture(paper, cell, prints))
     return Marked("plate", panel, prints)
 
 
@@ -301,8 +260,8 @@ def _prints(first: int, places: IntArray, side: int, ring: int) -> MarkerPrint:
 
 def moved(marked: Marked, dome_from_own: SE3) -> Marked:
     """Return a marked panel carried into another frame."""
-    panel = Panel(dome_from_own @ marked.panel.dome_from_panel, marked.panel.texture)
-    return Marked(marked.name, panel, marked.prints)
+    panel = replace(marked.panel, dome_from_panel=dome_from_own @ marked.panel.dome_from_panel)
+    return replace(marked, panel=panel)
 
 
 def board_mapping(board: CharucoPrint) -> dict[str, Any]:

@@ -101,36 +101,27 @@ class Development:
     # Radiance of a white surface in the light of the camera's own lamps, which is even over the
     # whole view and added to the daylight of the water.
     lamp: Vector = (0.0, 0.0, 0.0)
-    # Standard deviation of the blur of lens and pixels, in pixels.
-    defocus_px: float = 0.75
-    # Share of the light that the lens spreads over a halo.
-    flare: float = 0.02
-    # Standard deviation of that halo, in pixels.
-    flare_px: float = 12.0
-    # Mean grey (0 to 1, linear) that automatic exposure aims at.
-    exposure: float = 0.22
-    # Least and greatest gain of automatic exposure.
-    gains: tuple[float, float] = (0.25, 4.0)
+    defocus_px: float = 0.75  # Standard deviation of the blur of lens and pixels, in pixels.
+    flare: float = 0.02  # Share of the light that the lens spreads over a halo.
+    flare_px: float = 12.0  # Standard deviation of that halo, in pixels.
+    exposure: float = 0.22  # Mean grey (0 to 1, linear) that automatic exposure aims at.
+    gains: tuple[float, float] = (0.25, 4.0)  # Least and greatest gain of automatic exposure.
     # Drift of the overall gain and of the balance of red and of blue.
     exposure_drift: Drift = Drift()
     red_drift: Drift = Drift()
     blue_drift: Drift = Drift()
     # Strength of automatic white balance towards a grey mean of the picture, 0 to 1.
     white_balance: float = 0.6
-    # Standard deviation in the dark, of full scale at gain 1.
-    read_noise: float = 0.004
+    read_noise: float = 0.004  # Standard deviation in the dark, of full scale at gain 1.
     # Variance of the noise per unit of light, of full scale squared at gain 1.
     shot_noise: float = 1.5e-4
     # One colour a pixel (Bayer, red top left), the others interpolated between neighbours.
     mosaic: bool = True
-    # Grey level = light**(1 / gamma), before `contrast`.
-    gamma: float = 2.0
+    gamma: float = 2.0  # Grey level = light**(1 / gamma), before `contrast`.
     # Strength of an S curve over that, 0 to 1: darker shadows, lights that reach white earlier.
     contrast: float = 0.0
-    # Grey level of no light, of full scale.
-    black: float = 0.0
-    # Strength of the unsharp mask on luma.
-    sharpening: float = 0.0
+    black: float = 0.0  # Grey level of no light, of full scale.
+    sharpening: float = 0.0  # Strength of the unsharp mask on luma.
     # Its standard deviations along x and y, in pixels; 0 leaves a direction alone.
     sharpening_px: tuple[float, float] = (1.0, 1.0)
     # Blur of chroma along x and y, in pixels: noise reduction, or bandwidth.
@@ -144,20 +135,9 @@ class Development:
         t: float,
         rng: np.random.Generator | None,
     ) -> NDArray[np.uint8]:
-        """Return the picture (height, width, 3), red, green, blue, before it is compressed.
+        """Return the picture before it is compressed; see `SimulatedCamera.picture`.
 
-        Parameters
-        ----------
-        radiance : float32 array, shape (height, width, 3)
-            Before the lens, in the bands of `ColourFilters`; black where no light comes through.
-        water : WaterOptics
-            Its halo.
-        filters : ColourFilters
-            Of the sensor.
-        t : float
-            In seconds; exposure and white balance drift with it.
-        rng : Generator or None
-            None leaves noise out.
+        `water`: its halo is used. `filters`: of the sensor.
         """
         lens = CameraSensor(defocus_px=self.defocus_px)
         light = spread(radiance, water, lens)
@@ -171,7 +151,7 @@ class Development:
         # The least of the three gains is 1, so that a clipped pixel is white.
         raw = np.minimum(raw * (balance / balance.min()), 1.0).astype(np.float32)
         raw = np.clip(_mixed(raw, filters.correcting), 0.0, 1.0)
-        return self._finish(self._toned(raw))
+        return self._finish(raw)
 
     def _gains(self, raw: Rgb, t: float) -> tuple[float, FloatArray]:
         """Return the gain of all colours and those of red, green and blue, from the mean picture.
@@ -195,13 +175,11 @@ class Development:
             raw = np.asarray(raw + noise, dtype=np.float32)
         return np.asarray(np.clip(raw * np.float32(gain), 0.0, 1.0), dtype=np.float32)
 
-    def _toned(self, linear: Rgb) -> Rgb:
+    def _finish(self, linear: Rgb) -> NDArray[np.uint8]:
+        """Apply the tone curve, sharpen the luma, blur the chroma, and round to 8 bits."""
         grey = linear ** np.float32(1.0 / self.gamma)
         grey += np.float32(self.contrast) * (grey * grey * (3.0 - 2.0 * grey) - grey)
-        return np.asarray(self.black + (1.0 - self.black) * grey, dtype=np.float32)
-
-    def _finish(self, grey: Rgb) -> NDArray[np.uint8]:
-        """Sharpen the luma, blur the chroma, and round to 8 bits."""
+        grey = np.asarray(self.black + (1.0 - self.black) * grey, dtype=np.float32)
         luma = cv2.transform(grey, LUMA[None].astype(np.float32))
         chroma = _blurred(grey - luma[..., None], self.chroma_px)
         if self.sharpening > 0.0:
@@ -224,8 +202,8 @@ class SimulatedCamera:
         """Return a scene with the camera's own lamps on."""
         if self.development is None or not any(self.development.lamp):
             return scene
-        both = np.add(scene.water.ambient, self.development.lamp)
-        ambient = float(both[0]), float(both[1]), float(both[2])
+        red, green, blue = np.add(scene.water.ambient, self.development.lamp).tolist()
+        ambient = (red, green, blue)
         return replace(scene, water=replace(scene.water, ambient=ambient))
 
     def picture(
@@ -241,13 +219,14 @@ class SimulatedCamera:
         Parameters
         ----------
         radiance : float32 array, shape (height, width, 3)
-            Radiance before the lens, rendered with this camera's `filters`.
+            Before the lens, rendered with this camera's `filters`; black where no light comes
+            through.
         water : WaterOptics
             Its halo.
         sensor : CameraSensor
             The scene's; used by the ideal camera only.
         t : float
-            Time in seconds.
+            Time in seconds, with which exposure and white balance drift.
         rng : Generator, optional
             Source of noise; without it there is none.
         """
@@ -264,8 +243,8 @@ def _blurred(image: Rgb, sigmas: tuple[float, float]) -> Rgb:
     """Return a picture blurred along x and y; a sigma of 0 leaves a direction alone."""
     if not any(sigmas):
         return image
-    kernels = [_bell(sigma) for sigma in sigmas]
-    return np.asarray(cv2.sepFilter2D(image, -1, kernels[0], kernels[1]))
+    x, y = map(_bell, sigmas)
+    return np.asarray(cv2.sepFilter2D(image, -1, x, y))
 
 
 def _bell(sigma: float) -> NDArray[np.float32]:
@@ -372,10 +351,7 @@ CAMERAS: Mapping[str, SimulatedCamera] = MappingProxyType(
 
 
 def simulated_camera(name: str) -> SimulatedCamera:
-    """Return a camera by its name.
-
-    Raises `OptionError` if there is none of that name.
-    """
+    """Return a camera by its name; raise `OptionError` if there is none of that name."""
     if name not in CAMERAS:
         raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(CAMERAS)}")
     return CAMERAS[name]

@@ -8,8 +8,8 @@ import contextlib
 import csv
 import os
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,17 +55,8 @@ def vehicle_attitude(dome_from_scene: SE3) -> tuple[float, float, float]:
 def write_vehicle_log(scenario: Scenario, path: Path) -> None:
     """Write depth and attitude of the vehicle, ten times a second, with the noise of sensors.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        With a net or a wall as its target.
-    path : Path
-        A CSV file with `LOG_COLUMNS`, on its own clock (`LEAD_S`).
-
-    Raises
-    ------
-    OSError
-        Error of the system.
+    The scenario has a net or a wall as its target; the CSV file has `LOG_COLUMNS`, on its own clock
+    (`LEAD_S`).
     """
     rng = np.random.default_rng([scenario.seed, 23])
     rate_hz = 10.0
@@ -82,20 +73,10 @@ def write_vehicle_log(scenario: Scenario, path: Path) -> None:
 
 
 def write_hole_truth(scenario: Scenario, path: Path) -> None:
-    """Write the places of the holes in a scenario's nets.
+    """Write the places of the holes in a scenario's nets as a CSV file with `HOLE_COLUMNS`.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        With nets.
-    path : Path
-        A CSV file with `HOLE_COLUMNS`: right and up of the vehicle's foot on the net in the first
-        frame, diameter, depth and bearing, and the time at which the vehicle's foot is nearest.
-
-    Raises
-    ------
-    OSError
-        Error of the system.
+    These are right and up of the vehicle's foot on the net in the first frame, diameter, depth and
+    bearing, and the time at which the vehicle's foot is nearest.
     """
     times = np.array(list(scenario.times()))
     feet = np.array([_foot(scenario, t) for t in times])
@@ -127,15 +108,12 @@ def writable(path: Path) -> Iterator[None]:
         ) from None
 
 
-@dataclass(frozen=True, slots=True)
-class DiveFiles:
+class DiveFiles(NamedTuple):
     """Files written by `simulate_dive`."""
 
-    # `dive.mp4` and `truth.csv`.
-    video: Path
-    truth: Path
-    # Frames written.
-    n_frames: int
+    video: Path  # `dive.mp4`.
+    truth: Path  # `truth.csv`.
+    n_frames: int  # Frames written.
 
 
 def simulate_dive(
@@ -226,20 +204,9 @@ def frames_of_picture(picture: int, t: float, shutter: Shutter) -> list[tuple[in
 def shutter_from_words(words: str, fps: float, place: str = "--shutter") -> Shutter:
     """Return the shutter that words name, of the option `--shutter` or of a scenario.
 
-    Parameters
-    ----------
-    words : str
-        `global`, `rolling:READOUT_MS` or `interlaced`, each with `:EXPOSURE_MS` at its end where
-        that is not 0.
-    fps : float
-        Pictures a second; the fields of an interlaced one are half a picture apart.
-    place : str
-        Where the words come from, for the error.
-
-    Raises
-    ------
-    OptionError
-        If they name no shutter.
+    `words`: `global`, `rolling:READOUT_MS` or `interlaced`, each with `:EXPOSURE_MS` at its end
+    where that is not 0. `fps`: pictures a second; the fields of an interlaced one are half a
+    picture apart. Raises `OptionError`, which names `place`, if they name no shutter.
     """
     kind, *numbers = words.split(":")
     try:
@@ -263,10 +230,7 @@ def shutter_from_words(words: str, fps: float, place: str = "--shutter") -> Shut
 
 
 def check_shutter(shutter: Shutter, fps: float) -> None:
-    """Refuse a shutter that takes longer for a picture than pictures are apart.
-
-    Raises `OptionError` if it does.
-    """
+    """Raise `OptionError` if a shutter takes longer for a picture than pictures are apart."""
     # Two fields make a frame, and the second is as far from the next frame's first.
     needed = abs(shutter.readout) * (2.0 if shutter.is_interlaced else 1.0)
     needed = max(needed, shutter.exposure)

@@ -130,8 +130,7 @@ class LaserSource:
     direction: FloatArray
     # Half the fan's opening in radians (in air, behind a window).
     half_angle: float = float(np.deg2rad(34.0))
-    # Standard deviation of the sheet's thickness at the source, in metres.
-    sigma: float = 0.45e-3
+    sigma: float = 0.45e-3  # Standard deviation of the sheet's thickness at the source, in metres.
     # Growth of that standard deviation with distance (in the water), in radians.
     divergence: float = 0.75e-3
     # Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the source,
@@ -150,8 +149,7 @@ class Sheets(NamedTuple):
     # Shape (n, N_FAN): distance from the source at which the sheet's middle meets a surface;
     # infinite where none.
     first: FloatArray
-    # Shape (n, COLUMNS): the sheets for the kernels of `aqualvs.optics.sheet`.
-    optics: FloatArray
+    optics: FloatArray  # Shape (n, COLUMNS): the sheets for the kernels of `aqualvs.optics.sheet`.
     # Shape (n, 2): greatest distance of a bent sheet from the plane near it: metres at the window,
     # and metres for every metre from the source.
     stray: FloatArray
@@ -167,7 +165,6 @@ def _source_on(laser: Laser, rig: Rig) -> LaserSource:
 
     Behind a window it is the rig's source.
     """
-    wavelength_nm = laser_wavelength_nm(laser)
     normal = laser.plane.normal
     forward = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     length = float(np.linalg.norm(forward))
@@ -178,12 +175,12 @@ def _source_on(laser: Laser, rig: Rig) -> LaserSource:
         )
     forward /= length
     if laser.window is not None:
-        source = sheet_in(laser, rig.n_air, rig.n_water).source
-        return LaserSource(position=source, direction=forward, wavelength_nm=wavelength_nm)
-    foot = normal * laser.plane.offset
-    back = (foot[1] - 0.01) / forward[1]
+        position = sheet_in(laser, rig.n_air, rig.n_water).source
+    else:
+        foot = normal * laser.plane.offset
+        position = foot - (foot[1] - 0.01) / forward[1] * forward
     return LaserSource(
-        position=foot - back * forward, direction=forward, wavelength_nm=wavelength_nm
+        position=position, direction=forward, wavelength_nm=laser_wavelength_nm(laser)
     )
 
 
@@ -248,8 +245,7 @@ class FanRays(NamedTuple):
     # directions.
     origins: FloatArray
     directions: FloatArray
-    # Shape (N_FAN,): length of the light's way from the source to there.
-    way: FloatArray
+    way: FloatArray  # Shape (N_FAN,): length of the light's way from the source to there.
 
 
 def fan_rays(rig: Rig, sheets: Sheets, i: int) -> FanRays:
@@ -345,16 +341,10 @@ def add_colour(seen: Vec, light: float, sheets: Sheets, i: int) -> Vec:
 
 
 def light_on_points(points: FloatArray, sheets: Sheets, attenuation: Vec) -> FloatArray:
-    """Return the laser light on free-floating points, shape (n, 3) in, (n, 3) out.
+    """Return the laser light (n, 3) on free-floating points (n, 3) in `dome`, in metres.
 
-    Parameters
-    ----------
-    points : array, shape (n, 3)
-        In `dome`, in metres.
-    sheets : Sheets
-        With the distances at which surfaces end them.
-    attenuation : (float, float, float)
-        Of the water per metre, for red, green and blue.
+    `sheets`: with the distances at which surfaces end them. `attenuation`: of the water per metre,
+    for red, green and blue.
     """
     light = np.zeros((len(points), 3))
     _light_on_points(np.ascontiguousarray(points), sheets, attenuation, light)

@@ -11,7 +11,7 @@ by stepping and bisection.
 """
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from aqualvs.geometry.linear_algebra import (
 from aqualvs.geometry.transforms import SE3
 from aqualvs.simulation.scene import Fold, Net
 from aqualvs.simulation.textures import Tiles, sample, white_at
+
+if TYPE_CHECKING:
+    from aqualvs.simulation.surfaces import Surfaces
 
 NET, DIRECTION_U, DIRECTION_V, PLACE, HEIGHT, WIDTH, PERIOD, FOLD_COLUMNS = range(8)
 
@@ -104,18 +107,6 @@ class _TwineLook(NamedTuple):
 _TWINE = _TwineLook()
 
 
-class _FoldSteps(NamedTuple):
-    """Search along a ray for a folded net."""
-
-    # Least step along a ray towards a folded net, and number of bisections of the last step.
-    step: float = 1e-3
-    max_steps: int = 200
-    halvings: int = 16
-
-
-_STEPS = _FoldSteps()
-
-
 class Strand(NamedTuple):
     """Intersection of a ray with a strand."""
 
@@ -182,61 +173,49 @@ def _crossing(o: Vec, d: Vec, nets: FloatArray, i: int, lift: float) -> float:
 
 
 @inline_borrowing_kernel
-def _behind(o: Vec, d: Vec, t: float, nets: FloatArray, i: int, folds: FloatArray) -> float:
+def _behind(o: Vec, d: Vec, t: float, s: "Surfaces", i: int) -> float:
     """Return the distance of a place on a ray behind the folded net, along the net's normal."""
+    nets = s.nets
     rel = minus(along(o, d, t), row3(nets, i, ORIGIN))
     u, v = dot(rel, row3(nets, i, AXIS_U)), dot(rel, row3(nets, i, AXIS_V))
     bulge = 0.5 * (nets[i, KAPPA_U] * u * u + nets[i, KAPPA_V] * v * v)
-    return float(dot(rel, row3(nets, i, NORMAL)) - bulge - folded(u, v, folds, i)[0])
+    return float(dot(rel, row3(nets, i, NORMAL)) - bulge - folded(u, v, s.folds, i)[0])
 
 
 @inline_borrowing_kernel
-def _next_crossing(
-    o: Vec, d: Vec, nets: FloatArray, i: int, folds: FloatArray, begin: float
-) -> float:
+def _next_crossing(o: Vec, d: Vec, s: "Surfaces", i: int, begin: float) -> float:
     """Return the next crossing of a ray with the net after `begin`; infinite if there is none."""
-    low, high, steepest = fold_limits(folds, i)
+    low, high, steepest = fold_limits(s.folds, i)
     if low == 0.0 and high == 0.0:
-        t = _crossing(o, d, nets, i, 0.0)
+        t = _crossing(o, d, s.nets, i, 0.0)
         return t if t > begin else np.inf
-    first, last = _crossing(o, d, nets, i, low), _crossing(o, d, nets, i, high)
+    first, last = _crossing(o, d, s.nets, i, low), _crossing(o, d, s.nets, i, high)
     t = max(min(first, last), begin)
-    end = max(first, last) + _STEPS.step
+    # Least step along a ray towards a folded net, and number of bisections of the last step.
+    least_step, max_steps, halvings = 1e-3, 200, 16
+    end = max(first, last) + least_step
     if not end < 1e6:
         return np.inf
     # The height over the net limits the distance to it along the ray from below.
     share = 1.0 / (1.5 + steepest)
-    side = _behind(o, d, t, nets, i, folds)
-    for _ in range(_STEPS.max_steps):
+    side = _behind(o, d, t, s, i)
+    for _ in range(max_steps):
         if t >= end:
             break
-        step = max(share * abs(side), _STEPS.step)
-        now = _behind(o, d, t + step, nets, i, folds)
+        step = max(share * abs(side), least_step)
+        now = _behind(o, d, t + step, s, i)
         if side * now <= 0.0:
-            return _halved(o, d, t, t + step, side, nets, i, folds)
+            # By bisection, where the ray changes sides of the net.
+            before, after = t, t + step
+            for _ in range(halvings):
+                middle = 0.5 * (before + after)
+                if side * _behind(o, d, middle, s, i) > 0.0:
+                    before = middle
+                else:
+                    after = middle
+            return after
         t, side = t + step, now
     return np.inf
-
-
-@inline_borrowing_kernel
-def _halved(
-    o: Vec,
-    d: Vec,
-    before: float,
-    after: float,
-    side: float,
-    nets: FloatArray,
-    i: int,
-    folds: FloatArray,
-) -> float:
-    """Return by bisection where a ray changes sides of the net between two places."""
-    for _ in range(_STEPS.halvings):
-        middle = 0.5 * (before + after)
-        if side * _behind(o, d, middle, nets, i, folds) > 0.0:
-            before = middle
-        else:
-            after = middle
-    return after
 
 
 @inline_borrowing_kernel
@@ -333,45 +312,34 @@ def _cylinder(w: float, q: float, z: float, r: float) -> float:
 
 
 @inline_borrowing_kernel
-def meet_net(
-    o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, folds: FloatArray, tiles: Tiles
-) -> Strand:
+def meet_net(o: Vec, d: Vec, s: "Surfaces", i: int) -> Strand:
     """Return the first strand of net i that a ray meets."""
     found = NO_STRAND
     t = 0.0
     # Greatest number of layers of a folded net along a ray.
     max_layers = 5
     for _ in range(max_layers):
-        t = _next_crossing(o, d, nets, i, folds, t)
+        t = _next_crossing(o, d, s, i, t)
         if not t < 1e6:
             break
-        found = _meet_layer(o, d, t, nets, i, holes, folds, tiles)
+        found = _meet_layer(o, d, t, s, i)
         if found.t < np.inf:
             break
     return found
 
 
 @inline_borrowing_kernel
-def _meet_layer(
-    o: Vec,
-    d: Vec,
-    t: float,
-    nets: FloatArray,
-    i: int,
-    holes: FloatArray,
-    folds: FloatArray,
-    tiles: Tiles,
-) -> Strand:
+def _meet_layer(o: Vec, d: Vec, t: float, surfaces: "Surfaces", i: int) -> Strand:
     """Return the first strand that a ray meets where it crosses the net at `t`."""
-    best = NO_STRAND
+    best, nets, tiles = NO_STRAND, surfaces.nets, surfaces.tiles
     eu, ev, out = row3(nets, i, AXIS_U), row3(nets, i, AXIS_V), row3(nets, i, NORMAL)
     rel = minus(along(o, d, t), row3(nets, i, ORIGIN))
     u, v = dot(rel, eu), dot(rel, ev)
     if abs(u) > nets[i, HALF_U] or abs(v) > nets[i, HALF_V]:
         return best
-    if holes.shape[0] > 0 and _in_a_hole(u, v, holes, i):
+    if surfaces.holes.shape[0] > 0 and _in_a_hole(u, v, surfaces.holes, i):
         return best
-    _, slope_u, slope_v = folded(u, v, folds, i)
+    _, slope_u, slope_v = folded(u, v, surfaces.folds, i)
     flank = unit(combine(eu, -slope_u, ev, -slope_v, out, 1.0))
     tilt_u, tilt_v = slope_u + nets[i, KAPPA_U] * u, slope_v + nets[i, KAPPA_V] * v
     normal = unit(combine(eu, -tilt_u, ev, -tilt_v, out, 1.0))

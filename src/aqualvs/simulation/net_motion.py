@@ -53,8 +53,7 @@ class NetWall:
     sway: float = 0.0
     sway_period: float = 6.0
     sway_phase: float = 0.0
-    # Steady speed along `bearing`, in m/s.
-    drift: float = 0.0
+    drift: float = 0.0  # Steady speed along `bearing`, in m/s.
     # In radians about the horizontal through the middle; positive where the far normal points up,
     # as pitch.
     tilt: float = 0.0
@@ -79,14 +78,7 @@ class NetWall:
         """Return the true posture of a vehicle, as `aqualvs.scanning.posture` defines it.
 
         Range, pitch and yaw are those of the tangent plane at the nearest point, which is the
-        net itself if it is flat.
-
-        Parameters
-        ----------
-        world_from_dome : SE3
-            Pose of the dome's axes (right, forward, up).
-        time_s : float
-            Time in seconds.
+        net itself if it is flat. `world_from_dome`: the dome's axes are right, forward, up.
         """
         net = self.world_from_net(time_s)
         centre = (world_from_dome.translation - net.translation) @ net.rotation
@@ -99,14 +91,8 @@ class NetWall:
     def clearance(self, world_from_body: SE3, half_size: Sequence[float], time_s: float) -> float:
         """Return the least distance between net and hull, in metres; negative is a collision.
 
-        Parameters
-        ----------
-        world_from_body : SE3
-            Pose of the vehicle.
-        half_size : (float, float, float)
-            Half length, width and height of the hull, a box about the body's origin, in metres.
-        time_s : float
-            Time in seconds.
+        `half_size`: half length, width and height of the hull, a box about the body's origin, in
+        metres.
         """
         net = self.world_from_net(time_s)
         # Across the net's upright only.
@@ -133,20 +119,9 @@ class NetWall:
         leaves the cylinder by u⁴/(8 R³) at a distance u, and its mesh is stretched by u³/(6 R²).
         The stains on a wall behind a curved net move with the vehicle.
 
-        Parameters
-        ----------
-        world_from_dome : SE3
-            Pose of the dome's axes.
-        time_s : float
-            Time in seconds; render the scene at the same.
-        base : Scene
-            Scene in the frame of the net at rest; holes and folds of nets are placed along it and
-            up. Its `dome_from_scene` is not used.
-
-        Raises
-        ------
-        OptionError
-            If a net of `base` is bent by itself, or has edges while this wall is curved.
+        `base`: in the frame of the net at rest; holes and folds of nets are placed along it and up.
+        Its `dome_from_scene` is not used. Render the scene at the same time. Raises `OptionError`
+        if a net of `base` is bent by itself, or has edges while this wall is curved.
         """
         self._check(base.nets)
         dome_from_net = world_from_dome.inverse() @ self.world_from_net(time_s)
@@ -179,21 +154,9 @@ class NetWall:
     ) -> SE3:
         """Return world_from_dome of a level dome at a distance and yaw before a place on the net.
 
-        Parameters
-        ----------
-        distance : float
-            From the nearest point, in metres.
-        along, up : float
-            Place of that point on the net, in metres.
-        yaw : float
-            As `Posture.yaw`, in radians.
-        time_s : float
-            Time in seconds.
-
-        Raises
-        ------
-        OptionError
-            If the distance is not positive, or reaches the axis of a cage from inside.
+        `distance`: from the nearest point, which is at `along` and `up`, in metres. `yaw`: as
+        `Posture.yaw`, in radians. Raises `OptionError` if the distance is not positive, or reaches
+        the axis of a cage from inside.
         """
         if not distance > 0.0 or distance * self.curvature <= -1.0:
             raise OptionError(

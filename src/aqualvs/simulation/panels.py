@@ -50,29 +50,16 @@ COLUMNS = 12
 
 
 class PanelTables(NamedTuple):
-    """Panels as tables.
+    """Panels as tables."""
 
-    Attributes
-    ----------
-    frames : array, shape (P, 12)
-        Top-left corner, then unit vectors to the right, down and into the panel, in `dome`.
-    cells : array, shape (P,)
-        Side of a cell, in metres.
-    shape : int array, shape (P, 2)
-        Rows and columns.
-    start : int array, shape (P,)
-        Start of each panel's part of `sums`.
-    sums : array
-        Sums of albedo, one panel after another.
-
-    `sums[start[i] + r * (columns + 1) + c]` is the sum of the albedo over the first r rows and c
-    columns of panel i.
-    """
-
+    # Shape (P, 12): top-left corner, then unit vectors to the right, down and into the panel, in
+    # `dome`.
     frames: FloatArray
-    cells: FloatArray
-    shape: IntArray
-    start: IntArray
+    cells: FloatArray  # Shape (P,): side of a cell, in metres.
+    shape: IntArray  # Shape (P, 2): rows and columns.
+    start: IntArray  # Shape (P,): start of each panel's part of `sums`.
+    # `sums[start[i] + r * (columns + 1) + c]` is the sum of the albedo over the first r rows and c
+    # columns of panel i.
     sums: FloatArray
 
 
@@ -261,8 +248,7 @@ class Panel:
     # Of the frame with x to the right, y down, z into the panel and its origin at the outer corner
     # of the top-left cell.
     dome_from_panel: SE3
-    # The print; from behind it is seen mirrored.
-    texture: Texture
+    texture: Texture  # The print; from behind it is seen mirrored.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -273,10 +259,8 @@ class RoomLight:
     lamp: Vector = (0.5, -0.6, 0.9)  # The lamp's place in `dome`, in metres.
     # Share of the light that falls off with the angle to the lamp, 0 to 1.
     lamp_share: float = 0.45
-    # Red, green and blue of white.
-    tint: Vector = (1.0, 0.98, 0.93)
-    # Radiance that the water adds everywhere.
-    veil: Vector = (0.0, 0.0, 0.0)
+    tint: Vector = (1.0, 0.98, 0.93)  # Red, green and blue of white.
+    veil: Vector = (0.0, 0.0, 0.0)  # Radiance that the water adds everywhere.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,9 +293,8 @@ class PanelRenderer:
     ) -> NDArray[np.uint8]:
         """Return the picture (height, width, 3), red, green, blue; without `rng` no noise.
 
-        Exposure and white balance of `eye` drift with the time `t`, in seconds.
-
-        Raises `OptionError` if the scene has no panels.
+        Exposure and white balance of `eye` drift with the time `t`, in seconds. Raises
+        `OptionError` if the scene has no panels.
         """
         clear = WaterOptics(forward_scatter=0.0)
         return self.eye.picture(self.radiance(scene), clear, scene.sensor, t, rng)

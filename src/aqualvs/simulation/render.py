@@ -57,9 +57,11 @@ def add_snow(
     if scene.water.snow <= 0:
         return
     points, radii = _particles(scene.water.snow, t)
-    ahead = _before_target(points, scene)
-    pixels, valid = camera.project(points[ahead])
-    points, radii = points[ahead][valid], radii[ahead][valid]
+    if scene.target != "none":
+        before = scene.target_plane().signed_distance(points) < 0.0
+        points, radii = points[before], radii[before]
+    pixels, valid = camera.project(points)
+    points, radii = points[valid], radii[valid]
     lit = light_on_points(points, sheets, scene.water.attenuation)
     distance = np.linalg.norm(points, axis=-1)
     reach = np.exp(-np.outer(distance, scene.water.attenuation))
@@ -78,12 +80,6 @@ def _particles(count: int, t: float) -> tuple[FloatArray, FloatArray]:
     turns = start + own * _DRIFT * t / (_HIGH - _LOW)
     radii = rng.uniform(*_RADII, count)
     return _LOW + (turns % 1.0) * (_HIGH - _LOW), radii
-
-
-def _before_target(points: FloatArray, scene: Scene) -> BoolArray:
-    if scene.target == "none":
-        return np.ones(len(points), dtype=np.bool_)
-    return scene.target_plane().signed_distance(points) < 0.0
 
 
 def _pixels_per_radian(camera: Camera) -> float:
@@ -200,12 +196,10 @@ class Renderer:
     rig: Rig  # Camera, housing, water and lasers.
     # One for each laser; by default they follow from the rig (`default_sources`).
     sources: Sequence[LaserSource] = ()
-    # Rays along each side of a pixel: 2 means four rays a pixel.
-    samples: int = 2
+    samples: int = 2  # Rays along each side of a pixel: 2 means four rays a pixel.
     # Number of bands of rows rendered in parallel; the picture does not depend on it.
     threads: int = 1
-    # Sensor and processing; the rig has the place of the lens.
-    camera: SimulatedCamera = IDEAL
+    camera: SimulatedCamera = IDEAL  # Sensor and processing; the rig has the place of the lens.
 
     _corners: CornerRays = field(init=False, repr=False)
     _beams: Beams = field(init=False, repr=False)
@@ -234,16 +228,9 @@ class Renderer:
         """Return the picture with its middle at time `t`, as the rig's shutter takes it.
 
         Truth and marine snow are those of the middle. Each field of an interlaced picture has its
-        own blur and noise, as if the other one did not exist.
+        own blur and noise, as if the other one did not exist. Without `rng` there is no noise.
 
-        Parameters
-        ----------
-        scene_at : callable
-            Scene at any time from the first row to the last.
-        t : float
-            In seconds.
-        rng : Generator, optional
-            Without it the picture has no noise.
+        `scene_at`: the scene at any time from the first row to the last.
         """
         scene, shutter = scene_at(t), self.rig.shutter
         if shutter.instant:
@@ -299,22 +286,13 @@ class Renderer:
     def radiance(
         self, scene: Scene, t: float = 0.0, where: BoolArray | None = None
     ) -> NDArray[np.float32]:
-        """Return the radiance at the lens at time `t`, before blur, noise and saturation.
+        """Return the radiance (height, width, 3) at the lens, before blur, noise and saturation.
 
-        Parameters
-        ----------
-        scene : Scene
-            At time `t`.
-        t : float
-            In seconds.
-        where : bool array, shape (height, width), optional
-            Pixels to be traced; others may lack all light except that of marine snow.
+        It is red, green, blue; 1 is the sensor's full scale at gain 1. Zero where the lens model or
+        the housing lets no light through.
 
-        Returns
-        -------
-        radiance : float32 array, shape (height, width, 3)
-            Red, green, blue; 1 is the sensor's full scale at gain 1. Zero where the lens model
-            or the housing lets no light through.
+        `where`, shape (height, width): pixels to be traced; others may lack all light except that
+        of marine snow.
         """
         return self._radiance(scene, t, *self._pack(scene, t), where)
 

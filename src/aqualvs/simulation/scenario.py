@@ -44,16 +44,8 @@ def random_fish(
 ) -> tuple[Fish, ...]:
     """Return fish that cross the view at some time of the dive.
 
-    Parameters
-    ----------
-    rng : Generator
-        Random number generator.
-    count : int
-        Number of fish.
-    duration : float
-        Of the dive, in seconds.
-    behind : float
-        Free room behind the target plane, in metres, for example before a wall.
+    `duration`: of the dive, in seconds. `behind`: free room behind the target plane, in metres, for
+    example before a wall.
     """
     return tuple(_fish(rng, duration, behind) for _ in range(count))
 
@@ -76,13 +68,7 @@ def _fish(rng: np.random.Generator, duration: float, behind: float) -> Fish:
 def random_bubbles(
     rng: np.random.Generator, count: int, duration: float, behind: float
 ) -> tuple[Bubble, ...]:
-    """Return bubbles that rise through the view at some time of the dive.
-
-    Parameters
-    ----------
-    rng, count, duration, behind
-        As for `random_fish`.
-    """
+    """Return bubbles that rise through the view at some time of the dive; see `random_fish`."""
     return tuple(_bubble(rng, duration, behind) for _ in range(count))
 
 
@@ -103,20 +89,17 @@ def dome_from_target(
 ) -> SE3:
     """Return the pose of a target frame from the posture (docs/conventions.md).
 
+    y of the target frame is the far normal n; its z is as near to the dome's z as possible; without
+    slide its origin is the foot of the perpendicular from the dome's centre.
+
     Parameters
     ----------
     distance : float
         Range: distance of the dome's centre from the target plane, in metres.
     pitch, yaw : float
-        tan(pitch) = n_z / n_y and tan(yaw) = n_x / n_y for the far normal n, in radians.
+        tan(pitch) = n_z / n_y and tan(yaw) = n_x / n_y, in radians.
     slide : (float, float)
         Shift of the target in its plane, right and up, in metres.
-
-    Returns
-    -------
-    SE3
-        y of the target frame is n; its z is as near to the dome's z as possible; without slide its
-        origin is the foot of the perpendicular from the dome's centre.
 
     Raises
     ------
@@ -145,10 +128,8 @@ class Course:
     # Smooth passes through the values without overshoot; steps holds each of them for its share of
     # the dive.
     mode: Literal["smooth", "steps"] = "smooth"
-    # Amplitude of a sine on top.
-    sway: float = 0.0
-    # Of that sine, in seconds.
-    period: float = 4.0
+    sway: float = 0.0  # Amplitude of a sine on top.
+    period: float = 4.0  # Of that sine, in seconds.
 
     def at(self, t: float, duration: float) -> float:
         """Return the value at time `t` of a dive of `duration` seconds."""
@@ -189,13 +170,9 @@ class Trajectory:
 
     def pose_at(self, t: float, duration: float) -> SE3:
         """Return `dome_from_target` at time `t`."""
-        slide = (self.slide_x.at(t, duration), self.slide_z.at(t, duration))
-        return dome_from_target(
-            self.distance.at(t, duration),
-            self.pitch.at(t, duration),
-            self.yaw.at(t, duration),
-            slide,
-        )
+        courses = (self.distance, self.pitch, self.yaw, self.slide_x, self.slide_z)
+        distance, pitch, yaw, *slide = (course.at(t, duration) for course in courses)
+        return dome_from_target(distance, pitch, yaw, (slide[0], slide[1]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,8 +194,7 @@ class Scenario:
     water: WaterOptics = field(default_factory=WaterOptics)
     sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True
-    # Of the camera, in the words of `--shutter`; None leaves the rig's.
-    shutter: str | None = None
+    shutter: str | None = None  # Of the camera, in the words of `--shutter`; None leaves the rig's.
 
     @property
     def n_frames(self) -> int:
@@ -231,18 +207,9 @@ class Scenario:
 
     def scene_at(self, t: float) -> Scene:
         """Return the scene before the vehicle at time `t`; render it at the same `t`."""
-        return Scene(
-            dome_from_scene=self.trajectory.pose_at(t, self.duration),
-            walls=self.walls,
-            nets=self.nets,
-            fish=self.fish,
-            bubbles=self.bubbles,
-            boxes=self.boxes,
-            target=self.target,
-            water=self.water,
-            sensor=self.sensor,
-            lasers_on=self.lasers_on,
-        )
+        shared = [name for name in Scene.__slots__ if name != "dome_from_scene"]
+        content = {name: getattr(self, name) for name in shared}
+        return Scene(dome_from_scene=self.trajectory.pose_at(t, self.duration), **content)
 
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -40,10 +40,8 @@ class Wall:
     # Turn of the wall against the target plane, in radians; signs as for postures.
     yaw: float = 0.0
     pitch: float = 0.0
-    # Mean diffuse reflectance.
-    albedo: Vector = (0.50, 0.54, 0.52)
-    # Relative swing of the stains, 0 to 1.
-    contrast: float = 0.35
+    albedo: Vector = (0.50, 0.54, 0.52)  # Mean diffuse reflectance.
+    contrast: float = 0.35  # Relative swing of the stains, 0 to 1.
     # Distance of the joints between tiles in metres; 0 leaves the wall without joints.
     tile_pitch: float = 0.0
 
@@ -62,12 +60,9 @@ class Fold:
     direction: float = 0.0
     # Place of the crest along that direction, from the target's origin, in metres.
     place: float = 0.0
-    # In metres; positive away from the vehicle, as curvature.
-    height: float = -0.03
-    # Half the width at the foot, in metres.
-    width: float = 0.05
-    # Distance from crest to crest in metres; 0 is a single fold.
-    period: float = 0.0
+    height: float = -0.03  # In metres; positive away from the vehicle, as curvature.
+    width: float = 0.05  # Half the width at the foot, in metres.
+    period: float = 0.0  # Distance from crest to crest in metres; 0 is a single fold.
 
     @property
     def overlaps(self) -> bool:
@@ -91,26 +86,19 @@ class Net:
     roll: float = 0.0
     # Width of a diamond over its stretched width; 0.707 makes it a square on its corner.
     hanging_ratio: float = 0.7071
-    # Fraction of the twine's length that carries growth, 0 to 1.
-    fouling: float = 0.0
-    # Thickness of the growth at its thickest, in twine diameters.
-    growth: float = 1.0
-    # Fraction of the bars that are cut out, 0 to 1.
-    missing: float = 0.0
-    # Round holes in scene coordinates, in metres.
-    holes: tuple[Vector, ...] = ()
+    fouling: float = 0.0  # Fraction of the twine's length that carries growth, 0 to 1.
+    growth: float = 1.0  # Thickness of the growth at its thickest, in twine diameters.
+    missing: float = 0.0  # Fraction of the bars that are cut out, 0 to 1.
+    holes: tuple[Vector, ...] = ()  # Round holes in scene coordinates, in metres.
     # Along x and z in 1/m; positive bulges away from the vehicle.
     curvature: tuple[float, float] = (0.0, 0.0)
-    # Folds on top of that; heights add up.
-    folds: tuple[Fold, ...] = ()
+    folds: tuple[Fold, ...] = ()  # Folds on top of that; heights add up.
     # Half extent along x and z in metres; infinite by default.
     half_size: tuple[float, float] = (np.inf, np.inf)
     # Slide of the mesh in its plane along x and z, in metres.
     offset: tuple[float, float] = (0.0, 0.0)
-    # Diffuse reflectance of the clean twine.
-    albedo: Vector = (0.60, 0.62, 0.62)
-    # Seed of missing bars and growth.
-    seed: int = 0
+    albedo: Vector = (0.60, 0.62, 0.62)  # Diffuse reflectance of the clean twine.
+    seed: int = 0  # Seed of missing bars and growth.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,12 +108,9 @@ class Fish:
     # In `scene`, in metres and m/s, at time 0.
     position: Vector
     velocity: Vector = (0.15, 0.0, 0.0)
-    # Length of the body in metres; height and thickness follow.
-    length: float = 0.25
-    # Diffuse reflectance of the flank.
-    albedo: Vector = (0.40, 0.43, 0.42)
-    # Beats of the tail a second.
-    beat: float = 1.5
+    length: float = 0.25  # Length of the body in metres; height and thickness follow.
+    albedo: Vector = (0.40, 0.43, 0.42)  # Diffuse reflectance of the flank.
+    beat: float = 1.5  # Beats of the tail a second.
 
     def at(self, t: float) -> "Fish":
         """Return the fish `t` seconds later."""
@@ -139,8 +124,7 @@ class Bubble:
     # In `scene`, in metres and m/s, at time 0.
     position: Vector
     velocity: Vector = (0.0, 0.0, 0.2)
-    # In metres.
-    radius: float = 0.004
+    radius: float = 0.004  # In metres.
 
     def at(self, t: float) -> "Bubble":
         """Return the bubble `t` seconds later."""
@@ -169,16 +153,11 @@ class WaterOptics:
     ambient: Vector = (0.36, 0.62, 0.60)
     # Light that the water scatters from a laser sheet to the camera, per metre and steradian.
     sheet_scatter: float = 0.25
-    # Fraction of the light that arrives in a halo, out of focus.
-    forward_scatter: float = 0.04
-    # Standard deviation of that halo, in pixels.
-    halo_px: float = 9.0
-    # Relative strength of the moving light network of the waves, 0 to 1.
-    caustics: float = 0.0
-    # Radiance of the sun's glare at its brightest.
-    glare: float = 0.0
-    # Number of drifting particles before the camera.
-    snow: int = 0
+    forward_scatter: float = 0.04  # Fraction of the light that arrives in a halo, out of focus.
+    halo_px: float = 9.0  # Standard deviation of that halo, in pixels.
+    caustics: float = 0.0  # Relative strength of the moving light network of the waves, 0 to 1.
+    glare: float = 0.0  # Radiance of the sun's glare at its brightest.
+    snow: int = 0  # Number of drifting particles before the camera.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,14 +166,10 @@ class CameraSensor:
 
     # Exposure: factor on the radiance before it is clipped at the full scale of 1.
     gain: float = 1.0
-    # Grey level = 255 * radiance**(1 / gamma).
-    gamma: float = 1.25
-    # Standard deviation in the dark, of full scale.
-    read_noise: float = 0.004
-    # Variance of the noise per unit of radiance, of full scale squared.
-    shot_noise: float = 1.5e-4
-    # Standard deviation of the blur of lens and sensor, in pixels.
-    defocus_px: float = 0.75
+    gamma: float = 1.25  # Grey level = 255 * radiance**(1 / gamma).
+    read_noise: float = 0.004  # Standard deviation in the dark, of full scale.
+    shot_noise: float = 1.5e-4  # Variance of the noise per unit of radiance, of full scale squared.
+    defocus_px: float = 0.75  # Standard deviation of the blur of lens and sensor, in pixels.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,22 +183,11 @@ class Scene:
     fish: tuple[Fish, ...] = ()
     bubbles: tuple[Bubble, ...] = ()
     boxes: tuple[Box, ...] = ()
-    # Content of the plane y = 0, for the truth files.
-    target: Target = "none"
-    # Optical properties of the water.
-    water: WaterOptics = field(default_factory=WaterOptics)
+    target: Target = "none"  # Content of the plane y = 0, for the truth files.
+    water: WaterOptics = field(default_factory=WaterOptics)  # Optical properties of the water.
     # Optical and electronic properties of the camera.
     sensor: CameraSensor = field(default_factory=CameraSensor)
-    # False switches all lasers off.
-    lasers_on: bool = True
-
-    def at(self, t: float) -> "Scene":
-        """Return the scene with fish and bubbles moved on by `t` seconds."""
-        return replace(
-            self,
-            fish=tuple(fish.at(t) for fish in self.fish),
-            bubbles=tuple(bubble.at(t) for bubble in self.bubbles),
-        )
+    lasers_on: bool = True  # False switches all lasers off.
 
     def target_plane(self) -> Plane:
         """Return the target plane in `dome`, its normal away from the vehicle."""

@@ -39,8 +39,7 @@ class Light(NamedTuple):
     sheet_scatter: float
     caustics: float
     glare: float
-    # Moves the caustics, in seconds.
-    time: float
+    time: float  # Moves the caustics, in seconds.
 
 
 def pack_light(scene: Scene, t: float) -> Light:
@@ -215,24 +214,10 @@ def _over_bubble(
     mirrored = unit(along(d, normal, 2.0 * facing))
     sky = 0.35 + 0.55 * max(mirrored[2], 0.0) + 2.2 * max(dot(mirrored, _UP), 0.0) ** 60
     laser = scaled(_laser_light(p, normal, s, sheets, light), 0.35 + 0.5 * rim)
-    veil = _veil(d, light)
+    veil, rest = _veil(d, light), 1.0 - cover
+    red, green, blue = row3(light.colours, 2, 0)
     return (
-        _layer(behind[0], 0, cover, sky, laser[0], t, veil, light),
-        _layer(behind[1], 1, cover, sky, laser[1], t, veil, light),
-        _layer(behind[2], 2, cover, sky, laser[2], t, veil, light),
+        rest * behind[0] + cover * _through(red * sky + laser[0], 0, t, veil, light),
+        rest * behind[1] + cover * _through(green * sky + laser[1], 1, t, veil, light),
+        rest * behind[2] + cover * _through(blue * sky + laser[2], 2, t, veil, light),
     )
-
-
-@inline_borrowing_kernel
-def _layer(
-    behind: float,
-    channel: int,
-    cover: float,
-    sky: float,
-    laser: float,
-    path: float,
-    veil: float,
-    light: Light,
-) -> float:
-    own = _through(light.colours[2, channel] * sky + laser, channel, path, veil, light)
-    return (1.0 - cover) * behind + cover * own

@@ -41,15 +41,11 @@ class Surfaces(NamedTuple):
     holes: FloatArray  # Shape (n, 4): index of the net, u, v and radius.
     # Shape (n, columns): see `net.pack_fold`; the first column is the index of the net.
     folds: FloatArray
-    # As `walls`.
-    ellipsoids: FloatArray
+    ellipsoids: FloatArray  # As `walls`.
     all_ellipsoids: IntArray  # Shape (n,): all of their rows.
-    # As `walls`.
-    boxes: FloatArray
-    # As `walls`.
-    bubbles: FloatArray
-    # Noise for textures.
-    tiles: Tiles
+    boxes: FloatArray  # As `walls`.
+    bubbles: FloatArray  # As `walls`.
+    tiles: Tiles  # Noise for textures.
 
 
 class Hit(NamedTuple):
@@ -114,32 +110,18 @@ def _pack_fish(fish: Fish, pose: SE3, t: float) -> list[FloatArray]:
         (centre - bend @ [1.1 * size, 0.0, 0.0], bend, (0.24, 0.02, 0.30), _TAIL),
         (centre + turn @ [0.78 * size, 0.0, 0.05 * size], turn, (0.045, 0.13, 0.045), _EYE),
     ]
-    return [
-        _pack_ellipsoid(pose.apply(c), pose.rotation @ r, size * np.array(s), fish.albedo, part)
-        for c, r, s, part in parts
-    ]
-
-
-def _pack_ellipsoid(
-    centre: FloatArray, axes: FloatArray, half: FloatArray, albedo: Vec, part: float
-) -> FloatArray:
-    unit_from_dome = axes.T / half[:, None]
-    return np.concatenate([centre, unit_from_dome.ravel(), albedo, [part]])
+    rows = []
+    for place, axes, half, part in parts:
+        unit_from_dome = (pose.rotation @ axes).T / (size * np.array(half))[:, None]
+        albedo_and_part = [*fish.albedo, part]
+        rows.append(np.concatenate([pose.apply(place), unit_from_dome.ravel(), albedo_and_part]))
+    return rows
 
 
 def _pack_box(box: Box, pose: SE3) -> FloatArray:
     axes = pose.rotation @ rotation_from_rotvec([0.0, 0.0, box.heading])
     half = np.array(box.size) / 2.0
     return np.concatenate([pose.apply(box.centre), axes.T.ravel(), half, box.albedo])
-
-
-@inline_borrowing_kernel
-def meet_wall(o: Vec, d: Vec, walls: FloatArray, i: int) -> float:
-    """Return the distance to a wall; infinite behind the ray's origin."""
-    normal = row3(walls, i, _NORMAL)
-    t = dot(minus(row3(walls, i, _ORIGIN), o), normal) / dot(d, normal)
-    far = 1e3
-    return t if 0.0 < t < far else np.inf
 
 
 @inline_borrowing_kernel
@@ -188,13 +170,15 @@ def meet_box(o: Vec, d: Vec, boxes: FloatArray, i: int) -> tuple[float, Vec]:
 @inline_borrowing_kernel
 def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: int) -> Hit:
     """Return the first opaque surface on a ray, with the ellipsoids members[first:last]."""
+    far = 1e3
     t, kind, index, normal, met = np.inf, NONE, 0, (0.0, 0.0, 0.0), NO_STRAND
     for i in range(s.walls.shape[0]):
-        reach = meet_wall(o, d, s.walls, i)
-        if reach < t:
+        face_normal = row3(s.walls, i, _NORMAL)
+        reach = dot(minus(row3(s.walls, i, _ORIGIN), o), face_normal) / dot(d, face_normal)
+        if 0.0 < reach < far and reach < t:
             t, kind, index = reach, WALL, i
     for i in range(s.nets.shape[0]):
-        strand = meet_net(o, d, s.nets, i, s.holes, s.folds, s.tiles)
+        strand = meet_net(o, d, s, i)
         if strand.t < t:
             t, kind, index, normal, met = strand.t, NET, i, strand.normal, strand
     for i in range(s.boxes.shape[0]):
@@ -266,16 +250,8 @@ def _wall_albedo(p: Vec, walls: FloatArray, i: int, tiles: Tiles) -> Vec:
 def _fish_skin(p: Vec, ellipsoids: FloatArray, i: int, tiles: Tiles) -> tuple[Vec, Vec]:
     """Return normal and skin: dark back, pale belly, scales; a dark eye; a striped tail."""
     q = _to_local(minus(p, row3(ellipsoids, i, _CENTRE)), ellipsoids, i)
-    normal = unit(
-        combine(
-            row3(ellipsoids, i, _ROWS),
-            q[0],
-            row3(ellipsoids, i, _ROWS + 3),
-            q[1],
-            row3(ellipsoids, i, _ROWS + 6),
-            q[2],
-        )
-    )
+    a, b = row3(ellipsoids, i, _ROWS), row3(ellipsoids, i, _ROWS + 3)
+    normal = unit(combine(a, q[0], b, q[1], row3(ellipsoids, i, _ROWS + 6), q[2]))
     albedo = row3(ellipsoids, i, 12)
     if ellipsoids[i, _PART] == _EYE:
         return normal, scaled(albedo, 0.08)

@@ -32,8 +32,7 @@ class Tiles(NamedTuple):
     smooth: NDArray[np.float32]
     # Shape (512, 512): bright network on dark ground, mean 1: light focused by waves.
     ridges: NDArray[np.float32]
-    # Shape (256, 256): independent uniform values.
-    white: NDArray[np.float32]
+    white: NDArray[np.float32]  # Shape (256, 256): independent uniform values.
 
 
 @cache
@@ -116,8 +115,7 @@ class CharucoPrint:
     square: float
     marker: float
     border: float
-    # OpenCV's name of the markers' dictionary.
-    dictionary: str
+    dictionary: str  # OpenCV's name of the markers' dictionary.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,10 +126,8 @@ class MarkerPrint:
     ids: IntArray  # Shape (M,): number of each in the dictionary.
     # Shape (M, 2): column and row of each one's top-left corner, in cells.
     corners: IntArray = field(repr=False)
-    # Cells along a marker's side; a multiple of its bits and its frame together.
-    side: int
-    # Cells of white paper around each.
-    ring: int
+    side: int  # Cells along a marker's side; a multiple of its bits and its frame together.
+    ring: int  # Cells of white paper around each.
 
 
 def charuco_texture(board: CharucoPrint) -> Texture:
@@ -164,19 +160,9 @@ def charuco_texture(board: CharucoPrint) -> Texture:
 def marker_texture(ground: FloatArray, cell: float, prints: MarkerPrint) -> Texture:
     """Return a ground with markers on it, each in a ring of white paper.
 
-    Parameters
-    ----------
-    ground : array, shape (rows, columns)
-        Albedo of the ground under the markers; not changed.
-    cell : float
-        Side of a cell, in metres.
-    prints : MarkerPrint
-        Markers to put on it.
-
-    Raises
-    ------
-    OptionError
-        If a marker's side is no multiple of its cells, or it does not lie on the ground.
+    `ground`, shape (rows, columns): albedo under the markers. `cell`: side of a cell, in metres.
+    Raises `OptionError` if a marker's side is no multiple of its cells, or it does not lie on the
+    ground.
     """
     book = _dictionary(prints.dictionary)
     n_cells = book.markerSize + 2 * _FRAME
@@ -199,18 +185,8 @@ def mottled(
 ) -> FloatArray:
     """Return the albedo (rows, columns) of an uneven ground, such as concrete or plywood.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    albedo : float
-        Mean.
-    contrast : float
-        Half the spread over the mean.
-    scale : float
-        Cells over which a texel of the noise is stretched.
-    shift : int
-        Offset in the noise, so that panels differ.
+    `albedo`: mean. `contrast`: half the spread over the mean. `scale`: cells over which a texel of
+    the noise is stretched. `shift`: offset in the noise, so that panels differ.
     """
     tile = noise_tiles().smooth
     rows, columns = (((np.arange(n) / scale).astype(int) + shift) % len(tile) for n in shape)

@@ -35,12 +35,9 @@ class LitPoints:
 
     # Shape (N, 3): metres. On twine they lie on its surface, not on the net plane.
     points_in_dome: FloatArray
-    # Shape (N, 2): exact projections in `image`.
-    pixels: FloatArray
-    # Shape (N,): index into `Rig.lasers`.
-    laser: NDArray[np.int32]
-    # Shape (N,): `SurfaceKind` values.
-    label: NDArray[np.int32]
+    pixels: FloatArray  # Shape (N, 2): exact projections in `image`.
+    laser: NDArray[np.int32]  # Shape (N,): index into `Rig.lasers`.
+    label: NDArray[np.int32]  # Shape (N,): `SurfaceKind` values.
 
     def __len__(self) -> int:
         """Return the number of points."""

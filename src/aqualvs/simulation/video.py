@@ -10,7 +10,6 @@ from typing import Any, Literal, TypeAlias, cast
 import av
 import cv2
 import numpy as np
-from av.container import OutputContainer
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
@@ -32,20 +31,15 @@ class Compression:
     # lossless H.264 in RGB; or every frame as a separate JPEG (4:2:0, full range), as from USB
     # cameras.
     codec: Codec = "h264"
-    # Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
+    # Quality of "h264", 0 to 51; smaller is better.
     crf: int = 20
-    # Bits a second of "h264".
-    bit_rate: int | None = None
-    # Of "mjpeg", 1 to 100; larger is better.
-    jpeg_quality: int = 80
+    jpeg_quality: int = 80  # Of "mjpeg", 1 to 100; larger is better.
 
     def __post_init__(self) -> None:
         if self.codec not in {"h264", "lossless", "mjpeg"}:
             raise OptionError(f"codec is {self.codec!r}; choose h264, lossless or mjpeg")
         if not 0 <= self.crf <= 51:
             raise OptionError(f"crf is {self.crf}; it must lie between 0 and 51")
-        if self.bit_rate is not None and self.bit_rate <= 0:
-            raise OptionError(f"bit rate is {self.bit_rate}; it must be positive")
         if not 1 <= self.jpeg_quality <= 100:
             raise OptionError(f"JPEG quality is {self.jpeg_quality}; it must lie between 1 and 100")
 
@@ -61,25 +55,12 @@ _CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}
 class VideoWriter(Closing):
     """Writer of RGB frames to a video file; use it as a context manager to close the file.
 
-    Parameters
-    ----------
-    path : Path
-        File to write; the suffix chooses the container.
-    size_px : (int, int)
-        Width and height of every frame.
-    fps : float
-        Frames a second.
-    first_field : {"top", "bottom"} or None
-        Field that comes first in interlaced pictures: "h264" codes them as such, with chroma of
-        each field by itself, as capture devices do; the other codecs know no fields. None for
-        whole pictures.
+    The suffix of `path` chooses the container. `first_field`: field that comes first in interlaced
+    pictures; None for whole pictures. "h264" codes them as such, with chroma of each field by
+    itself, as capture devices do; the other codecs know no fields.
 
-    Raises
-    ------
-    OptionError
-        If an option makes no sense.
-    OutputError
-        If the file cannot be written or the encoder is missing.
+    Raises `OptionError` if an option makes no sense, `OutputError` if the file cannot be written or
+    the encoder is missing.
     """
 
     def __init__(
@@ -97,7 +78,8 @@ class VideoWriter(Closing):
         codec = _CODECS.get(self._recording.codec) or _lossy_codec()
         with _writing_video(path, ValueError):
             self._container = av.open(str(path), "w")
-            self._stream = _add_stream(self._container, codec, fps)
+            rate = Fraction(fps).limit_denominator(1001)
+            self._stream = cast(VideoStream, self._container.add_stream(codec, rate=rate))
             self._stream.width, self._stream.height = size_px
             self._set_quality(codec)
             self._container.start_encoding()
@@ -110,10 +92,10 @@ class VideoWriter(Closing):
         elif codec == "libx264rgb":
             stream.pix_fmt = "rgb24"
             stream.options = {"qp": "0", "preset": "veryfast"}
-        elif codec == "libx264" and recording.bit_rate is None:
+        elif codec == "libx264":
             stream.options = {"crf": str(recording.crf), "preset": "veryfast"}
         else:
-            stream.bit_rate = recording.bit_rate or _FALLBACK_BIT_RATE
+            stream.bit_rate = _FALLBACK_BIT_RATE
         if codec == "libx264":
             stream.options |= self._x264_options()
 
@@ -191,11 +173,6 @@ def _writing_video(path: Path, *more: type[Exception]) -> Iterator[None]:
         ) from None
 
 
-def _add_stream(container: OutputContainer, codec: str, fps: float) -> VideoStream:
-    rate = Fraction(fps).limit_denominator(1001)
-    return cast(VideoStream, container.add_stream(codec, rate=rate))
-
-
 def _planes(stacked: NDArray[np.uint8], height: int) -> tuple[NDArray[np.uint8], ...]:
     """Return views on Y, U and V of a 4:2:0 picture with its planes one after the other."""
     width = stacked.shape[1]
@@ -213,13 +190,9 @@ def _lossy_codec() -> str:
 
 
 def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Return an RGB picture as a JPEG file with chroma at half resolution (4:2:0).
+    """Return an RGB picture (height, width, 3) as a JPEG file, chroma at half resolution (4:2:0).
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width, 3)
-    quality : int
-        1 to 100; larger is better.
+    `quality`: 1 to 100; larger is better.
     """
     how = [cv2.IMWRITE_JPEG_QUALITY, quality]
     how += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]

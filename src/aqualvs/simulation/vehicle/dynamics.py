@@ -41,10 +41,8 @@ class Body(NamedTuple):
     # Shape (5, 6): rigid and added inertia, linear and quadratic drag; weight, buoyancy, centre of
     # buoyancy, displaced mass.
     hull: FloatArray
-    # Shape (6, n): force and moment of every thruster's unit thrust.
-    allocation: FloatArray
-    # Time constant of the thrusters, in seconds.
-    lag: float
+    allocation: FloatArray  # Shape (6, n): force and moment of every thruster's unit thrust.
+    lag: float  # Time constant of the thrusters, in seconds.
 
 
 class Work(NamedTuple):
@@ -399,16 +397,9 @@ def fly(
 ) -> None:
     """Advance the vehicle by `n` steps of `h` seconds under one effort.
 
-    Parameters
-    ----------
-    y : array, shape (13,)
-        State, see the docstring of this module.
-    thrusts : array, shape (n_thrusters,)
-        In newtons.
-    memory : array, shape (N_MEMORY,)
-        Of the autopilot.
-    effort : array, shape (4,)
-        Request of the sticks; see `Sticks.asked`.
+    `y`, shape (13,): state, see the docstring of this module. `thrusts`, shape (n_thrusters,): in
+    newtons. `memory`, shape (N_MEMORY,): of the autopilot. `effort`, shape (4,): request of the
+    sticks; see `StickInput.asked`.
     """
     for i in range(n):
         steer(y, effort, h, memory, pilot)

@@ -7,7 +7,7 @@ all three sources have them. The vehicles are fully under water.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.simulation.vehicle.water_motion import GRAVITY
 
 Six: TypeAlias = tuple[float, float, float, float, float, float]
+Numbers = TypeVar("Numbers", Vec, Six)
 
 _COS45 = math.sqrt(0.5)
 # Least share of a thruster's unit force or lever in a motion that it takes part in.
@@ -46,8 +47,7 @@ class ThrustCurve:
     # (Blue Robotics' chart; 5.25 and 4.10 kgf at 16 V).
     forward: float = 44.3
     reverse: float = 34.5
-    # Share of the command's travel without thrust. 0.07 is 28 of 400 µs.
-    dead_band: float = 0.07
+    dead_band: float = 0.07  # Share of the command's travel without thrust. 0.07 is 28 of 400 µs.
     # 0.6 follows the same chart at 12 V within 3 % of the greatest thrust, both ways.
     linear: float = 0.6
     # Time constant in seconds; 0.1 is a round number for a small propeller, not measured.
@@ -68,10 +68,8 @@ class StickInput:
     # Greatest, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of these vehicles
     # reaches; 0.5 is a pilot's choice.
     climb_rate: float = 0.5
-    # RC4_DZ, in microseconds; shrinks with the gain, as the next one.
-    yaw_dead_zone: int = 40
-    # THR_DZ, in thousandths of the throttle's travel.
-    throttle_dead_zone: int = 100
+    yaw_dead_zone: int = 40  # RC4_DZ, in microseconds; shrinks with the gain, as the next one.
+    throttle_dead_zone: int = 100  # THR_DZ, in thousandths of the throttle's travel.
     # RC4_TRIM (yaw), RC5_TRIM (forward) and RC6_TRIM (right), in microseconds.
     trims: tuple[int, int, int] = (1500, 1500, 1500)
 
@@ -80,18 +78,11 @@ class StickInput:
             raise OptionError(f"sticks: gain {self.gain:g}; choose more than 0, at most 1")
 
     def asked(self, x: int, y: int, z: int, r: int) -> tuple[float, float, float, float]:
-        """Return the request of stick positions in depth hold.
+        """Return the request (forward, right, down, turn) of stick positions in depth hold.
 
-        Parameters
-        ----------
-        x, y, z, r : int
-            As in MANUAL_CONTROL: z from 0 (down) over 500 to 1000 (up).
-
-        Returns
-        -------
-        forward, right, down, turn : float
-            Shares of the thrusters' motor input, of the greatest rate of descent and of the
-            greatest turning rate.
+        These are shares of the thrusters' motor input, of the greatest rate of descent and of the
+        greatest turning rate. The sticks are as in MANUAL_CONTROL: z from 0 (down) over 500 to
+        1000 (up).
         """
         yaw_trim, *level = self.trims
         forward, right = (
@@ -150,15 +141,12 @@ class Autopilot:
     # Of roll, pitch, yaw: motor input per rad/s, and per rad/s and second.
     rate: Vec = (0.135, 0.135, 0.18)
     rate_integral: Vec = (0.09, 0.09, 0.018)
-    # Requested climb rate per error of the depth, in m/s per metre.
-    depth: float = 1.0
+    depth: float = 1.0  # Requested climb rate per error of the depth, in m/s per metre.
     # Motor input per m/s, and per m/s and second.
     climb: float = 1.5
     climb_integral: float = 0.75
-    # Time constant of requested turning rates, in seconds (ATC_INPUT_TC).
-    input_time: float = 0.15
-    # Acceleration to requested climb rates, in m/s² (PILOT_ACCEL_Z).
-    acceleration: float = 1.0
+    input_time: float = 0.15  # Time constant of requested turning rates, in seconds (ATC_INPUT_TC).
+    acceleration: float = 1.0  # Acceleration to requested climb rates, in m/s² (PILOT_ACCEL_Z).
     # Time after the last requested turn during which the held heading follows the present one, in
     # seconds (ArduSub's mode_althold.cpp).
     settle: float = 0.25
@@ -177,18 +165,12 @@ class VehicleModel:
     added_mass: Six
     linear_drag: Six
     quadratic_drag: Six
-    # Any number; all with the same curve.
-    thrusters: Sequence[Thruster]
-    # Of every thruster.
-    curve: ThrustCurve = field(default_factory=ThrustCurve)
-    # Response to the sticks.
-    sticks: StickInput = field(default_factory=StickInput)
-    # Gains of the vehicle's own loops.
-    autopilot: Autopilot = field(default_factory=Autopilot)
-    # Centre of the camera's dome in body axes, in metres.
-    dome_position: Vec = (0.20, 0.0, 0.0)
-    # Half length, width and height of the hull, in metres.
-    half_size: Vec = (0.2286, 0.169, 0.127)
+    thrusters: Sequence[Thruster]  # Any number; all with the same curve.
+    curve: ThrustCurve = field(default_factory=ThrustCurve)  # Of every thruster.
+    sticks: StickInput = field(default_factory=StickInput)  # Response to the sticks.
+    autopilot: Autopilot = field(default_factory=Autopilot)  # Gains of the vehicle's own loops.
+    dome_position: Vec = (0.20, 0.0, 0.0)  # Centre of the camera's dome in body axes, in metres.
+    half_size: Vec = (0.2286, 0.169, 0.127)  # Half length, width and height of the hull, in metres.
 
     @property
     def weight(self) -> float:
@@ -214,17 +196,16 @@ class VehicleModel:
         return replace(
             self,
             mass=self.mass * mass,
-            inertia=_scaled3(self.inertia, mass),
+            inertia=_scaled(self.inertia, mass),
             buoyancy=self.buoyancy + (mass - 1.0) * self.weight,
-            linear_drag=_scaled6(self.linear_drag, drag),
-            quadratic_drag=_scaled6(self.quadratic_drag, drag),
+            linear_drag=_scaled(self.linear_drag, drag),
+            quadratic_drag=_scaled(self.quadratic_drag, drag),
         )
 
     def allocation(self) -> FloatArray:
         """Return force and moment on the body by unit thrust of every thruster, shape (6, n)."""
-        positions = np.array([one.position for one in self.thrusters])
         directions = np.array([one.direction for one in self.thrusters])
-        moments = np.cross(positions, directions)
+        moments = np.cross([one.position for one in self.thrusters], directions)
         return np.ascontiguousarray(np.vstack([directions.T, moments.T]))
 
     def mixing(self) -> FloatArray:
@@ -251,14 +232,8 @@ def _sign(values: FloatArray) -> FloatArray:
     return np.where(np.abs(values) > _TAKES_PART, np.sign(values), 0.0)
 
 
-def _scaled3(values: Vec, factor: float) -> Vec:
-    a, b, c = (factor * value for value in values)
-    return a, b, c
-
-
-def _scaled6(values: Six, factor: float) -> Six:
-    a, b, c, d, e, f = (factor * value for value in values)
-    return a, b, c, d, e, f
+def _scaled(values: Numbers, factor: float) -> Numbers:
+    return cast(Numbers, tuple(factor * value for value in values))
 
 
 def _level_four(x: float, y: float, z: float) -> tuple[Thruster, ...]:

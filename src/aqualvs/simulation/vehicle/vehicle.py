@@ -44,8 +44,7 @@ class SensorErrors:
     # Standard deviation and correlation time in seconds of a slow error (first-order Gauss-Markov).
     wander: float = 0.0
     wander_time: float = 30.0
-    # Readings a second.
-    rate: float = 10.0
+    rate: float = 10.0  # Readings a second.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,15 +76,7 @@ class Telemetry:
 
 
 class Reading:
-    """Readings of one sensor over time.
-
-    Parameters
-    ----------
-    sensor : SensorErrors
-        Its errors.
-    rng : Generator
-        Source of its noise.
-    """
+    """Readings of one sensor over time."""
 
     def __init__(self, sensor: SensorErrors, rng: np.random.Generator) -> None:
         self._sensor = sensor
@@ -136,12 +127,8 @@ class StickPositions(Protocol):
 def level_pose(position: FloatArray, heading: float) -> SE3:
     """Return world_from_body of a level vehicle.
 
-    Parameters
-    ----------
-    position : array, shape (3,)
-        North, east, down, in metres.
-    heading : float
-        Clockwise from north, in radians.
+    `position`, shape (3,): north, east, down, in metres. `heading`: clockwise from north, in
+    radians.
     """
     c, s = math.cos(heading), math.sin(heading)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -152,30 +139,11 @@ class SimulatedVehicle:
     """Simulated vehicle under a pilot's sticks.
 
     The world is north, east, down from the still surface; the body forward, right, down. The same
-    model, water, sticks and `rng` give the same dive.
+    model, water, sticks and `rng`, the source of the sensors' noise, give the same dive.
 
-    Parameters
-    ----------
-    model : VehicleModel
-        Hull, thrusters and autopilot.
-    water : WaterMotion
-        Current, waves and tether.
-    rng : Generator
-        Source of the sensors' noise.
-    world_from_body : SE3
-        Initial pose, at rest; it holds this heading and depth.
-    sensors : Sensors, optional
-        Errors of its sensors.
-    latency : float
-        Delay of stick positions, in seconds.
-    lapse : float
-        Time after the last ones until it holds still, in seconds (FS_PILOT_TIMEOUT).
-
-    Attributes
-    ----------
-    armed, obeys : bool
-        Disarmed, its thrusters stand still; if it does not obey, it holds heading and depth and
-        ignores the sticks. Both may be set, as by a pilot.
+    `world_from_body`: initial pose, at rest; it holds this heading and depth. `latency`: delay of
+    stick positions, in seconds. `lapse`: time after the last ones until it holds still, in seconds
+    (FS_PILOT_TIMEOUT).
     """
 
     def __init__(
@@ -196,6 +164,8 @@ class SimulatedVehicle:
             )
         self.model, self.water = model, water
         self.latency, self.lapse = latency, lapse
+        # Disarmed, its thrusters stand still; if it does not obey, it holds heading and depth and
+        # ignores the sticks. Both may be set, as by a pilot.
         self.armed, self.obeys = True, True
         self._body, self._pilot = pack_body(model), pack_pilot(model)
         self._idle = self._pilot._replace(curve=np.array([0.0, 0.0, 0.0, 1.0]))
@@ -270,7 +240,10 @@ class SimulatedVehicle:
         end = self._time + dt
         while self._time < end:
             self._take_what_has_come()
-            self._fly(min(end, self._next_change(end)))
+            # Until the stick positions in force change.
+            arrives = self._coming[0][0] if self._coming else end
+            lapses = self._heard + self.lapse
+            self._fly(min(end, arrives, lapses if lapses > self._time + 1e-9 else end))
         self._take_what_has_come()
 
     def telemetry(self) -> Telemetry:
@@ -307,12 +280,6 @@ class SimulatedVehicle:
     def _take_what_has_come(self) -> None:
         while self._coming and self._coming[0][0] <= self._time + 1e-12:
             self._heard, self._effort = self._coming.popleft()
-
-    def _next_change(self, end: float) -> float:
-        """Return the time of the next change of the stick positions in force."""
-        arrives = self._coming[0][0] if self._coming else end
-        ends = self._heard + self.lapse
-        return min(arrives, ends if ends > self._time + 1e-9 else end)
 
     def _fly(self, end: float) -> None:
         duration = end - self._time

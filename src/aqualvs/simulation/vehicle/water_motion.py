@@ -31,12 +31,9 @@ class Waves:
 
     # Half the height from trough to crest, in metres. Irregular waves have the same mean square.
     amplitude: float
-    # In seconds; of irregular waves the middle one.
-    period: float = 5.0
-    # Direction of propagation, in radians clockwise from north.
-    direction: float = 0.0
-    # Number of sine waves; 1 is a regular swell.
-    n: int = 1
+    period: float = 5.0  # In seconds; of irregular waves the middle one.
+    direction: float = 0.0  # Direction of propagation, in radians clockwise from north.
+    n: int = 1  # Number of sine waves; 1 is a regular swell.
     # Periods of irregular waves are spread evenly over this share of the period to either side,
     # directions at random over as many radians.
     spread: float = 0.25
@@ -99,14 +96,10 @@ class WaterMotion:
     # their period, in seconds.
     wander: float = 0.0
     wander_period: float = 40.0
-    # None for calm water.
-    waves: Waves | None = None
-    # Drags and pulls at the vehicle.
-    tether: Tether = field(default_factory=Tether)
-    # In kg/m³.
-    density: float = 1025.0
-    # Seed of the phases of waves and wander.
-    seed: int = 0
+    waves: Waves | None = None  # None for calm water.
+    tether: Tether = field(default_factory=Tether)  # Drags and pulls at the vehicle.
+    density: float = 1025.0  # In kg/m³.
+    seed: int = 0  # Seed of the phases of waves and wander.
 
     def pack(self) -> "Flow":
         """Return the water for kernels; the same seed gives the same water."""
@@ -184,12 +177,7 @@ _GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 def tether_force(stream: Vec, velocity: Vec, flow: Flow) -> Vec:
     """Return the force of the tether on the vehicle, in the world, in newtons.
 
-    Parameters
-    ----------
-    stream, velocity : (float, float, float)
-        Of the water without waves, and of the vehicle, in the world, in m/s.
-    flow : Flow
-        With the tether.
+    `stream`, `velocity`: of the water without waves, and of the vehicle, in the world, in m/s.
     """
     north, east = 0.0, 0.0
     for i in range(3):
