@@ -423,7 +423,7 @@ def measure_solidity(
         _ERRORS.unresolved * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
     )
     shares = [_spread_of_mean(np.concatenate(rows)), _ERRORS.share, unresolved]
-    bare = float(np.sum(twine.body * lattice.density / lattice.pitch))
+    bare = float(np.sum(twine.body * lattice.mesh.density / lattice.pitch))
     grown = _ERRORS.growth * max(solidity - bare, 0.0)
     sigmas = [chance, _family_sum(error, seen, counts), grown, *(solidity * one for one in shares)]
     return float(np.clip(solidity, 0.0, 1.0)), float(np.linalg.norm(sigmas))
