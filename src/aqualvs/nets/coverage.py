@@ -135,12 +135,8 @@ class Twine:
 def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twine | None:
     """Fit twine and sheet to the dashes of several kinds; None without any.
 
-    Parameters
-    ----------
-    kinds : sequence of DashKind
-        The more different their angles and slants, the better.
-    known : float, optional
-        Known diameter of the bare twine in metres: then the halo is measured.
+    The more different the angles and slants of the kinds, the better. Where the diameter of the
+    bare twine is `known`, in metres, the halo is measured.
     """
     if not kinds:
         return None
@@ -155,12 +151,9 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
         return Twine(known, 0.0, body, float(sheet), halo, _TWINE.seen * sigma_strand)
     step, height = np.median([[k.step, k.height] for k in kinds], axis=0)
     faint = max(1.0 - float(height) / _TWINE.faint, 0.0)
-    of_halo = (
-        math.hypot(_TWINE.sigma_halo * float(step), _TWINE.sigma_faint * faint * float(strand))
-        / _TWINE.seen
-    )
-    sigma = math.hypot(sigma_strand, of_halo)
     body = float(strand)
+    of_halo = math.hypot(_TWINE.sigma_halo * float(step), _TWINE.sigma_faint * faint * body)
+    sigma = math.hypot(sigma_strand, of_halo / _TWINE.seen)
     return Twine(
         thickness=body / silhouette,
         sigma=sigma / silhouette,
@@ -316,7 +309,7 @@ def _angles(lattice: NetLattice, one: RegisteredView) -> _Angles:
 def dash_kinds(lattice: NetLattice, frames: Sequence[RegisteredView]) -> list[DashKind]:
     """Group whole dashes that lie clearly on one strand by laser and family."""
     rows = [_rows(lattice, one) for one in frames]
-    table = np.concatenate(rows) if rows else np.empty((0, 9))
+    table = np.concatenate([np.empty((0, 9)), *rows])
     kinds = np.unique(table[:, :2], axis=0)
     each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
     each = [mine for mine in each if len(mine) >= _KIND.min_dashes]
@@ -419,9 +412,8 @@ def measure_solidity(
     blocks = np.array_split(np.arange(len(frames)), min(_KIND.blocks, len(frames)))
     parts = [_family_sum(body[b], seen[b], counts) for b in blocks]
     chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
-    unresolved = (
-        _ERRORS.unresolved * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
-    )
+    pixel = frames[len(frames) // 2].view.pixel
+    unresolved = _ERRORS.unresolved * pixel / float(lattice.pitch.min())
     shares = [_spread_of_mean(np.concatenate(rows)), _ERRORS.share, unresolved]
     bare = float(np.sum(twine.body * lattice.mesh.density / lattice.pitch))
     grown = _ERRORS.growth * max(solidity - bare, 0.0)

@@ -74,18 +74,12 @@ def hidden_lines(
         N of them; points labelled as on the net are never before it.
     in_net : array, shape (N, 3)
         Their places in `net`; z is the distance before the net.
-    row : int array, shape (N,)
-        Their search lines.
-    position : array, shape (N,)
-        Their positions along their search lines, in pixels.
+    row, position : array, shape (N,)
+        Their search lines, and positions along these in pixels.
     line_px : int array, shape (L,)
         Pixels across each laser's search lines.
-    eye : array, shape (3,)
-        The camera in `net`.
-    sources : array, shape (L, 3)
-        Roughly where each laser's light comes from, in `net`.
-    lines : LaserLines
-        Where the lasers' lines run.
+    eye, sources : array, shape (3,) and (L, 3)
+        The camera in `net`, and roughly where each laser's light comes from.
     off : float
         What is nearer to the net's plane is on it, in metres.
 
@@ -108,18 +102,8 @@ def hidden_lines(
     thing = _chain(laser, row[index], position[index])
     order = np.argsort(thing, kind="stable")
     index, laser, thing = index[order], laser[order], thing[order]
-    _hide(
-        thing,
-        laser,
-        row[index],
-        position[index],
-        np.ascontiguousarray(in_net[index]),
-        line_px,
-        eye,
-        sources,
-        lines,
-        hidden,
-    )
+    light = thing, laser, row[index], position[index], np.ascontiguousarray(in_net[index])
+    _hide(*light, line_px, eye, sources, lines, hidden)
     return hidden
 
 
@@ -155,11 +139,8 @@ def _chain(laser: IntArray, row: IntArray, position: FloatArray) -> IntArray:
             ends[kept] = last
             between = row[k] - row[last]
             away = abs(position[k] - position[last])
-            if (
-                between > 0
-                and away <= _HIDDEN.between_px + _HIDDEN.slope_px * between
-                and away < least
-            ):
+            reach = _HIDDEN.between_px + _HIDDEN.slope_px * between
+            if between > 0 and away <= reach and away < least:
                 best, least = kept, away
             kept += 1
         n_ends = kept

@@ -195,19 +195,9 @@ def align_log(
 ) -> AlignedLog:
     """Align a log with a dive's clock.
 
-    Parameters
-    ----------
-    log : VehicleLog
-        Of the same dive.
-    offset_s : float or None
-        Log time minus dive time, where the user knows it.
-    video : Path or None
-        Video whose clock may be used.
-
-    Notes
-    -----
-    Without an offset from the user it is estimated from the motion common to both; the clocks of
-    video and log help where that is ambiguous, and replace it where there is no motion.
+    Without an offset from the user (log time minus dive time) it is estimated from the motion
+    common to both; the clocks of video and log help where that is ambiguous, and replace it where
+    there is no motion.
     """
     given = offset_s is not None and TimeOffset(offset_s, 0.0, None, "given by the user")
     offset = given or _estimate_offset(log, postures, video)
@@ -280,17 +270,9 @@ def place_net(
 ) -> NetPlaces:
     """Place stretches and holes on the unrolled net.
 
-    Parameters
-    ----------
-    stretches, holes : sequence
-        As `NetCondition` gives them, in the order of time.
-    postures : DivePostures
-        Of the same dive.
-    vehicle : VehiclePlaces, optional
-        The vehicle's log, aligned with the dive's clock.
+    Stretches and holes are those of `NetCondition`, in the order of time; the vehicle's log is
+    aligned with the dive's clock.
 
-    Notes
-    -----
     The net's depth at the foot of the perpendicular follows from the vehicle's depth and attitude
     and from the posture; where the log has no attitude the vehicle counts as level. Its mean over
     15 s before and after corrects the track's height, which limits both the log's noise and the
