@@ -38,19 +38,10 @@ _STYLE: dict[Any, Any] = {
 
 
 def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
-    """Draw the map of a net.
+    """Draw the map of a net; without a stretch the picture says so.
 
-    Parameters
-    ----------
-    wall : UnrolledNet
-        Net to draw; without a stretch the picture says so.
-    paths : sequence of Path
-        Files to write; the suffix (`.png`, `.svg`, `.pdf`) selects the format.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
+    The suffix of each path (`.png`, `.svg`, `.pdf`) selects its format. Raises `OSError` if a file
+    cannot be written.
     """
     import matplotlib as mpl
 
@@ -121,8 +112,7 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
 
 def _rows(size: FloatArray) -> int:
     """Return the number of rows that a wall is cut into, so that no row is a thin line."""
-    # The wall is cut into rows until a row is at least this high for its width, or up to this
-    # number.
+    # Least height of a row for its width.
     min_ratio = 0.13
     max_rows = 8
     return min(max(math.ceil(min_ratio * float(size[0] / size[1])), 1), max_rows)
@@ -269,12 +259,7 @@ def _scale_bar(axes: "Axes", wall: UnrolledNet, length: float) -> None:
         textcoords="offset points",
         ha="center",
         va="bottom",
-        bbox={
-            "boxstyle": "round,pad=0.15",
-            "facecolor": "white",
-            "edgecolor": "none",
-            "alpha": 0.8,
-        },
+        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
     )
 
 
@@ -289,14 +274,13 @@ def _legend(figure: "Figure", wall: UnrolledNet) -> None:
     from matplotlib.patches import Patch
 
     path = Line2D([], [], color=_INK, marker="o", markersize=3.5, markerfacecolor=_PATH)
-    start = Line2D(
-        [], [], linestyle="", marker=">", color=_PATH, markeredgecolor=_INK, markersize=8
+    start, hole = (
+        Line2D([], [], linestyle="", marker=mark, color=fill, markeredgecolor=edge, markersize=size)
+        for mark, fill, edge, size in ((">", _PATH, _INK, 8), ("o", "white", _HOLE, 9))
     )
     shown: dict[str, Line2D | Patch] = {"vehicle’s track": path, "its start": start}
     if wall.holes:
-        shown["hole with its number, to scale"] = Line2D(
-            [], [], linestyle="", marker="o", markersize=9, color="white", markeredgecolor=_HOLE
-        )
+        shown["hole with its number, to scale"] = hole
     if any(fouling_of(one) is None for one in wall.stretches):
         shown["not measured"] = Patch(facecolor=_GREY, edgecolor="white", hatch="////")
     figure.legend(
