@@ -68,11 +68,12 @@ def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
     be decoded with all frames from there on.
     """
     chosen = _refused_rows(track)
+    spread = np.arange(len(track))
     valid = np.flatnonzero(track.valid)
     if len(valid):
         relative = track.sigma[valid, 0] / track.posture[valid, 0]
         chosen.append(int(valid[np.nan_to_num(relative).argmax()]))
-    spread = valid if len(valid) else np.arange(len(track))
+        spread = valid
     special = set(chosen)
     while len(set(chosen)) < min(N_PICTURES, len(set(chosen) | set(spread.tolist()))):
         chosen.append(_farthest(spread, chosen))
@@ -125,21 +126,12 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
 
 
 def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -> SampleFrame:
-    """Cut the surroundings of a place out of a picture, with a ring around the place.
+    """Cut the surroundings of a place out of a BGR picture, with a ring around the place.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width, 3)
-        BGR.
-    middle : (float, float)
-        Column and row.
-    diameter : float
-        Of the ring, in pixels.
+    `middle`: its column and row. `diameter`: of the ring, in pixels.
     """
     # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
-    px = 160
-    shown_px = 320
-    diameters = 2.5
+    px, shown_px, diameters = 160, 320, 2.5
     height, width = map(int, image.shape[:2])
     side = min(round(max(diameters * diameter, px)), width, height)
     left, top = (

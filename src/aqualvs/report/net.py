@@ -13,7 +13,7 @@ from aqualvs.report.html import Card, Raw, data_url, folded, table, text
 from aqualvs.report.run_data import mapping
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
-from aqualvs.text import clock, signed
+from aqualvs.text import clock, count_text, signed
 
 _LONG_TABLE = 12
 _NONE = "–"
@@ -76,11 +76,10 @@ def net_cards(net: NetTables | None) -> list[Card]:
     """Return the card of the headline; none without a net."""
     if net is None or not net.stretches:
         return []
-    n = len(net.holes)
-    value = "no holes" if not n else "1 hole" if n == 1 else f"{n} holes"
+    n, words = len(net.holes), []
+    value = count_text(n, "hole") if n else "no holes"
     if not net.holes_known:
         value = "holes not known"
-    words = []
     largest = max((_number(row, "diameter_mm") or 0.0 for row in net.holes), default=0.0)
     if largest:
         words.append(f"up to {largest:.0f} mm")
@@ -115,10 +114,7 @@ def hole_pictures(net: NetTables) -> list[HolePicture]:
 
 
 def net_view(net: NetTables | None, crops: Mapping[str, SampleFrame] = MappingProxyType({})) -> str:
-    """Return the section on the net; nothing without one.
-
-    `crops`: number of a hole to its picture.
-    """
+    """Return the section on the net, with pictures by the numbers of holes; nothing without one."""
     if net is None:
         return ""
     head = '<section id="net"><h2>Net</h2>\n'
