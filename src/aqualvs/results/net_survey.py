@@ -57,17 +57,7 @@ class NetResult:
 class NetPass:
     """Evaluation of a dive's net, scan by scan, and the writer of its files.
 
-    Parameters
-    ----------
-    rig : Rig
-        That the scans were made with.
-    request : NetRequest
-        What to find out; its log is read at once.
-
-    Raises
-    ------
-    AqualvsError
-        If the log cannot be read.
+    The log of the request is read at once; raises `AqualvsError` if it cannot be read.
     """
 
     def __init__(self, rig: Rig, request: NetRequest) -> None:
@@ -77,7 +67,8 @@ class NetPass:
         self._rig, self._request = rig, request
         self._log = open_log(request.log, request.log_offset_s)
         self._condition = NetCondition(rig, request.options())
-        self._postures = [array("d") for _ in range(4)]
+        # Time, range, pitch and yaw, four numbers a frame.
+        self._postures = array("d")
         self._n_frames = 0
 
     def add(self, scan: Scan) -> None:
@@ -86,27 +77,15 @@ class NetPass:
         posture = scan.posture
         if not isinstance(posture, Posture) or not _is_net(scan):
             return
-        values = (scan.time_s, posture.range, posture.pitch, posture.yaw)
-        for column, value in zip(self._postures, values, strict=True):
-            column.append(value)
+        self._postures.extend((scan.time_s, posture.range, posture.pitch, posture.yaw))
         self._condition.add(scan)
 
     def write(self, folder: Path, video: Path | None = None) -> NetResult:
-        """Finish, write the files of `NET_FILES` and return the result.
+        """Finish, write the files of `NET_FILES` into a folder that exists; return the result.
 
-        Parameters
-        ----------
-        folder : Path
-            That exists.
-        video : Path or None
-            Of the dive; its clock may help to lay the log on it.
-
-        Raises
-        ------
-        OutputError
-            If a file cannot be written.
-        OptionError
-            If the twine was given thicker than the mesh's bars are long.
+        The clock of the dive's video may help to lay the log on it. Raises `OutputError` if a file
+        cannot be written, `OptionError` if the twine was given thicker than the mesh's bars are
+        long.
         """
         from aqualvs.nets.places import DivePostures, align_log, place_net
         from aqualvs.nets.tables import net_dict, net_lines, unroll
@@ -114,7 +93,7 @@ class NetPass:
         self._condition.finish()
         stretches, holes = self._condition.stretches, self._condition.holes
         self._check_twine([one.lattice.bar for one in stretches if one.lattice is not None])
-        postures = DivePostures(*(np.array(column) for column in self._postures))
+        postures = DivePostures(*np.array(self._postures).reshape(-1, 4).T.copy())
         log = None
         if self._log is not None:
             log = align_log(self._log, postures, self._request.log_offset_s, video)
