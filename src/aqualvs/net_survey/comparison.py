@@ -20,6 +20,7 @@ from aqualvs.net_survey.frames import (
     WallFrame,
     align,
     common_frame,
+    corners_of,
     has_places,
     looked_at,
     place_survey,
@@ -197,34 +198,31 @@ def _counterparts(distance: FloatArray, group: IntArray) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class _Visits:
-    """Places that the lasers of each dive looked at, with their uncertainty."""
+    """Places that the lasers of each dive looked at, with the date and their uncertainty."""
 
     raster: Raster
-    seen: list[BoolArray]
-    sigma: list[FloatArray]
-    visit: list[int]
+    n_dates: int
+    dives: list[tuple[BoolArray, int, FloatArray]]
 
     @classmethod
     def of(
         cls, placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame
     ) -> "_Visits":
-        corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])
-        low, high = corners.min(axis=0), corners.max(axis=0)
+        low, high = corners_of(placed)
         max_squares = 4_000_000
         side = max(_SIDE, float(np.sqrt(np.prod(high - low) / max_squares)))
         raster = Raster.over(low, high, side, frame)
         dates = sorted({one.survey.date for one in placed})
-        return cls(
-            raster,
-            [looked_at(one, raster) for one in placed],
-            [np.hypot(a.sigma, b.sigma) for a, b in zip(placed, shifts, strict=True)],
-            [dates.index(one.survey.date) for one in placed],
-        )
+        dives = [
+            (looked_at(a, raster), dates.index(a.survey.date), np.hypot(a.sigma, b.sigma))
+            for a, b in zip(placed, shifts, strict=True)
+        ]
+        return cls(raster, len(dates), dives)
 
-    def chance(self, place: FloatArray, sigma: FloatArray, n_dates: int) -> FloatArray:
+    def chance(self, place: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return with what chance (V,) a place was looked at on each date."""
-        found = np.zeros(n_dates)
-        for seen, own, visit in zip(self.seen, self.sigma, self.visit, strict=True):
+        found = np.zeros(self.n_dates)
+        for seen, visit, own in self.dives:
             at = place + _normal_samples() * np.hypot(sigma, own)
             index = self.raster.index(at)
             share = float(np.mean(np.where(index >= 0, seen[index], False)))
@@ -260,8 +258,9 @@ def _site(
         # A dive sees too little of a hole, never too much: of one date the largest counts.
         if not size <= sizes[visit]:
             sizes[visit], errors[visit] = size, float(np.linalg.norm(holes.sigma[numbers]))
-    looked = visits.chance(place[best], sigma[best], n_dates)
+    looked = visits.chance(place[best], sigma[best])
     looked[np.isfinite(sizes)] = 1.0
+    runs = [(placed[parts[k][0]].survey, parts[k][1]) for k in mine]
     return Site(
         state=_state(sizes, errors, looked),
         place=place[best],
@@ -269,10 +268,7 @@ def _site(
         sizes=sizes,
         sigma_sizes=errors,
         looked=looked,
-        numbers=[
-            f"{placed[parts[k][0]].survey.name}:{placed[parts[k][0]].survey.holes.number[parts[k][1]]}"
-            for k in mine
-        ],
+        numbers=[f"{one.name}:{one.holes.number[i]}" for one, i in runs],
     )
 
 
@@ -320,15 +316,7 @@ class Comparison:
 
 
 def compare(surveys: Sequence[Survey], cell: float) -> Comparison:
-    """Compare dives along the same net.
-
-    Parameters
-    ----------
-    surveys : sequence
-        Of two dates or more.
-    cell : float
-        Side of the cells in metres.
-    """
+    """Compare dives along the same net, of two dates or more, by cells of a side in metres."""
     ordered = sorted(surveys, key=lambda one: (one.date, one.name))
     dates = sorted({one.date for one in ordered})
     whole = [_mean_solidity(one for one in ordered if one.date == day) for day in dates]

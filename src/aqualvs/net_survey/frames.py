@@ -166,6 +166,11 @@ class Raster:
     periodic: bool  # Whether u goes round.
 
     @classmethod
+    def around(cls, dives: Sequence[PlacedSurvey], side: float, frame: WallFrame) -> "Raster":
+        """Cover what dives passed over with squares of about a side."""
+        return cls.over(*corners_of(dives), side, frame)
+
+    @classmethod
     def over(cls, low: FloatArray, high: FloatArray, side: float, frame: WallFrame) -> "Raster":
         """Cover a rectangle with squares of about a side; their edges are multiples of it."""
         size = np.array([side, side])
@@ -198,17 +203,18 @@ class Raster:
         return np.asarray(self.low + (np.stack([column, row], axis=-1) + 0.5) * self.size)
 
 
+def corners_of(dives: Sequence[PlacedSurvey]) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the greatest u and d, shape (2,) each, that dives passed over."""
+    corners = np.concatenate([one.outline.reshape(-1, 2) for one in dives])
+    return corners.min(axis=0), corners.max(axis=0)
+
+
 def spread_over(outline: FloatArray, side: float, share: float = 1.0) -> FloatArray:
     """Return places (K, n, 2) that fill outlines (K, 4, 2) evenly.
 
-    Parameters
-    ----------
-    outline : array, shape (K, 4, 2)
-        Corners in turn, beginning with an edge along the way.
-    side : float
-        Places are no farther apart than this, unless the outline is very large.
-    share : float
-        Of the width across the way, about the middle.
+    Corners are in turn, beginning with an edge along the way. Places are no farther apart than
+    `side`, unless the outline is very large. `share`: of the width across the way, about the
+    middle, that is filled.
     """
     if not len(outline):
         return np.empty((0, 1, 2))
@@ -293,8 +299,7 @@ class SurveyShift:
         return cls(np.zeros(2), np.zeros(2), np.ones(2, np.bool_))
 
 
-@dataclass(frozen=True, slots=True)
-class ShiftGrid:
+class ShiftGrid(NamedTuple):
     """Grid of the shifts that are tried."""
 
     steps: tuple[FloatArray, FloatArray]  # In u and d, as multiples of `STEP`.
@@ -318,11 +323,9 @@ def align(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
     chance /= chance.sum()
     value, spread, determined = np.zeros(2), sigma.copy(), np.zeros(2, np.bool_)
     for axis in range(2):
-        near = (
-            max(_ALIGNMENT.near * sigma[axis], _ALIGNMENT.min_near)
-            if np.isfinite(sigma[axis])
-            else _ALIGNMENT.flat_near
-        )
+        near = _ALIGNMENT.flat_near
+        if np.isfinite(sigma[axis]):
+            near = max(_ALIGNMENT.near * sigma[axis], _ALIGNMENT.min_near)
         shifts = STEP * grid.steps[axis]
         marginal = chance.sum(axis=1 - axis)
         inside = np.abs(shifts - shifts[np.argmax(marginal)]) <= near
@@ -400,8 +403,7 @@ def _pattern_gain(
 
 def _pattern(earlier: Sequence[PlacedSurvey], frame: WallFrame) -> tuple[Raster, FloatArray]:
     """Return the solidity of earlier dives less their median, NaN where they have not been."""
-    corners = np.concatenate([one.outline.reshape(-1, 2) for one in earlier])
-    raster = Raster.over(corners.min(axis=0), corners.max(axis=0), STEP, frame)
+    raster = Raster.around(earlier, STEP, frame)
     total, weight = np.zeros(raster.n), np.zeros(raster.n)
     for one in earlier:
         if not len(one.rows):
@@ -493,8 +495,8 @@ def _holes_gain(
     known = np.array([one.holes[k] for one, k in parts])
     size = np.array([one.survey.holes.diameter[k] for one, k in parts])
     spread = np.array([one.sigma for one, _ in parts])
-    corners = np.concatenate([one.outline.reshape(-1, 2) for one in earlier])
-    area = max(float(np.prod(np.ptp(corners, axis=0))), 1.0)
+    low, high = corners_of(earlier)
+    area = max(float(np.prod(high - low)), 1.0)
     shift = np.stack(np.meshgrid(*(STEP * s for s in grid.steps), indexing="ij"), axis=-1)
     for place, diameter in zip(later.holes, later.survey.holes.diameter, strict=True):
         density = np.zeros(gain.shape)
@@ -510,10 +512,6 @@ def _holes_gain(
 
 def _size_gain(one: float, other: float) -> float:
     """Return how much more likely two diameters are those of one hole than of any two."""
-    off = float(np.log(one / other))
-    again = (
-        _ALIGNMENT.sizes
-        / _ALIGNMENT.size
-        * np.exp(-0.5 * off**2 * (_ALIGNMENT.size**-2 - _ALIGNMENT.sizes**-2))
-    )
+    off, size, sizes = float(np.log(one / other)), _ALIGNMENT.size, _ALIGNMENT.sizes
+    again = sizes / size * np.exp(-0.5 * off**2 * (size**-2 - sizes**-2))
     return _ALIGNMENT.seen_alike * float(again) + 1.0 - _ALIGNMENT.seen_alike

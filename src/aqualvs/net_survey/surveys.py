@@ -275,16 +275,17 @@ def _holes(rows: Sequence[Row]) -> Holes:
 
 def _lasers_share(facts: Mapping[str, Any], outline: FloatArray) -> float:
     """Return how much of the height of the picture's bands lasers looked at."""
-    looked, passed = facts.get("summary", {}).get("area_m2"), float(np.abs(_areas(outline)).sum())
+    looked, passed = facts.get("summary", {}).get("area_m2"), float(areas(outline).sum())
     if not isinstance(looked, int | float) or not passed > 0.0:
         return _LASERS_SHARE
     return float(np.clip(looked / passed, 0.1, 1.0))
 
 
-def _areas(outline: FloatArray) -> FloatArray:
+def areas(outline: FloatArray) -> FloatArray:
+    """Return the areas (K,) in outlines (K, 4, 2)."""
     x, y = outline[..., 0], outline[..., 1]
     turned = x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1)
-    return np.asarray(0.5 * turned.sum(axis=-1))
+    return np.asarray(0.5 * np.abs(turned.sum(axis=-1)), np.float64)
 
 
 def _outlines(features: Sequence[Mapping[str, Any]], n: int) -> FloatArray:
