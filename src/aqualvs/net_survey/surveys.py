@@ -50,8 +50,7 @@ def date_of_run(folder: Path) -> tuple[date, str]:
     source = _source(folder)
     names = [(folder.resolve().name, "the folder's name"), (source.name, "the video's name")]
     for name, words in names:
-        found = named_date(name)
-        if found is not None:
+        if (found := named_date(name)) is not None:
             return found, words
     start = dive_start_utc(source) if source.is_file() else None
     if start is not None:
@@ -187,13 +186,10 @@ def left_out(folder: Path) -> list[str]:
     missing = [run.name for run in runs if not (run / NET_CSV).is_file()]
     if not missing:
         return []
-    n = len(missing)
-    words = (
-        "dive whose net has not been evaluated is"
-        if n == 1
-        else "dives whose nets have not been evaluated are"
-    )
-    return [f"{folder}: {n} {words} left out: {', '.join(missing)} (aqualvs net)"]
+    words = "dives whose nets have not been evaluated are"
+    if len(missing) == 1:
+        words = "dive whose net has not been evaluated is"
+    return [f"{folder}: {len(missing)} {words} left out: {', '.join(missing)} (aqualvs net)"]
 
 
 def read_survey(folder: Path, day: date) -> Survey:
@@ -207,8 +203,7 @@ def read_survey(folder: Path, day: date) -> Survey:
     facts = content["aqualvs_net"]
     try:
         outline = _outlines(content["features"], len(rows))
-        stretches = _stretches(rows, outline)
-        found = _holes(holes)
+        stretches, found = _stretches(rows, outline), _holes(holes)
         n_holes = facts.get("summary", {}).get("n_holes", len(holes))
         if n_holes != len(holes):
             raise ValueError(f"{HOLES_CSV} holds {len(holes)} of {n_holes} holes")
