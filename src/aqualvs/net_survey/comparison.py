@@ -222,20 +222,15 @@ class _Visits:
     def chance(self, place: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return with what chance (V,) a place was looked at on each date."""
         found = np.zeros(self.n_dates)
+        # Spread like a normal distribution, always the same ones.
+        n = 16
+        at = ndtri((np.arange(n) + 0.5) / n)
+        samples = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
         for seen, visit, own in self.dives:
-            at = place + _normal_samples() * np.hypot(sigma, own)
-            index = self.raster.index(at)
+            index = self.raster.index(place + samples * np.hypot(sigma, own))
             share = float(np.mean(np.where(index >= 0, seen[index], False)))
             found[visit] = max(found[visit], share)
         return found
-
-
-def _normal_samples() -> FloatArray:
-    """Return places (n, 2) spread like a normal distribution, always the same ones."""
-    draws = 256
-    n = int(np.sqrt(draws))
-    at = ndtri((np.arange(n) + 0.5) / n)
-    return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
 
 
 def _site(

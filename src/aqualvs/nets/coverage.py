@@ -255,21 +255,6 @@ class _KindOptions(NamedTuple):
 _KIND = _KindOptions()
 
 
-class _SolidityErrors(NamedTuple):
-    """Errors of solidity, as shares."""
-
-    # Errors of solidity for dashes that run together or are not seen, as shares: of any net, and
-    # per pixel in the distance of two strands (simulated dives).
-    share: float = 0.04
-    unresolved: float = 1.5
-    # And as a share of the area that growth adds: it stands out of the net, and is lit and seen
-    # askew.
-    growth: float = 0.25
-
-
-_ERRORS = _SolidityErrors()
-
-
 @dataclass(frozen=True, slots=True)
 class RegisteredView:
     """A frame with the place of the lattice in it."""
@@ -412,11 +397,15 @@ def measure_solidity(
     blocks = np.array_split(np.arange(len(frames)), min(_KIND.blocks, len(frames)))
     parts = [_family_sum(body[b], seen[b], counts) for b in blocks]
     chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
+    # Errors for dashes that run together or are not seen, as shares: of any net, and per pixel in
+    # the distance of two strands (simulated dives); and as a share of the area that growth adds: it
+    # stands out of the net, and is lit and seen askew.
+    of_any, per_pixel, of_growth = 0.04, 1.5, 0.25
     pixel = frames[len(frames) // 2].view.pixel
-    unresolved = _ERRORS.unresolved * pixel / float(lattice.pitch.min())
-    shares = [_spread_of_mean(np.concatenate(rows)), _ERRORS.share, unresolved]
+    unresolved = per_pixel * pixel / float(lattice.pitch.min())
+    shares = [_spread_of_mean(np.concatenate(rows)), of_any, unresolved]
     bare = float(np.sum(twine.body * lattice.mesh.density / lattice.pitch))
-    grown = _ERRORS.growth * max(solidity - bare, 0.0)
+    grown = of_growth * max(solidity - bare, 0.0)
     sigmas = [chance, _family_sum(error, seen, counts), grown, *(solidity * one for one in shares)]
     return float(np.clip(solidity, 0.0, 1.0)), float(np.linalg.norm(sigmas))
 

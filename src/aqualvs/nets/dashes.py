@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, kernel
-from aqualvs.nets.lit_intervals import LineState, NetSignal
+from aqualvs.nets.lit_intervals import LineState, NetFrame, NetSignal
 from aqualvs.nets.spectrum import Crossings
 
 
@@ -235,17 +235,9 @@ class Gaps:
 
 
 @dataclass(frozen=True, slots=True)
-class NetView:
-    """Dashes and gaps of the net in one frame, L lasers; a summary of the `NetSignal`."""
+class NetView(NetFrame):
+    """Dashes and gaps of the net in one frame; a summary of the `NetSignal`."""
 
-    # As in the `NetSignal`.
-    index: int
-    time_s: float
-    range: float
-    origin: FloatArray
-    direction: FloatArray
-    search: FloatArray
-    pixel: float
     # Shape (L,): typical length of laser line per search line, in metres.
     step: FloatArray
     # Shape (L,): share of each laser's dark search lines whose light is seen on something behind

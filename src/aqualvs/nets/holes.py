@@ -8,7 +8,7 @@ estimated from the dive itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -28,21 +28,6 @@ from aqualvs.nets.hole_candidates import (
 )
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
-
-
-class _HoleOptions(NamedTuple):
-    """Missing strands that are one hole."""
-
-    # Missing strands may be a hole if this near to each other, in bars, and with this much
-    # evidence; strands within the last distance determine its edge.
-    near: float = 1.5
-    min_near: float = 9.0
-    around: float = 6.5
-    # Cells farther from the vehicle than this are settled, in metres.
-    settled: float = 2.0
-
-
-_HOLE = _HoleOptions()
 
 _ROW = 1 << 24
 
@@ -176,21 +161,23 @@ class HoleMap:
 
     def _near(self, places: FloatArray) -> BoolArray:
         """Mark the places (..., 2) in the part of the map that is not settled."""
-        return np.asarray(np.abs(places - self._last).max(axis=-1) < _HOLE.settled)
+        settled = 2.0  # In metres.
+        return np.asarray(np.abs(places - self._last).max(axis=-1) < settled)
 
     def _find(self, lattice: NetLattice) -> list[Hole]:
         places, weights = self._looks.places, self._looks.weights()
         bar = lattice.bar
+        # Missing strands may be a hole if this near to each other, in bars, and with this much
+        # evidence; strands within the last distance determine its edge.
+        near, min_near, reach = 1.5, 9.0, 6.5
         likely = np.flatnonzero(weights > 0.0)
-        near = local_sums(places[likely], weights[likely], _HOLE.near * bar)
-        likely = likely[near > _HOLE.min_near]
+        likely = likely[local_sums(places[likely], weights[likely], near * bar) > min_near]
         found, left = [], weights.copy()
         # Discs no farther apart than this are one hole, in bars.
         touch = 1.2
-        for group in _groups(places[likely], 2.0 * _HOLE.near * bar):
+        for group in _groups(places[likely], 2.0 * near * bar):
             seeds = places[likely[group]]
-            low = seeds.min(axis=0) - _HOLE.around * bar
-            high = seeds.max(axis=0) + _HOLE.around * bar
+            low, high = seeds.min(axis=0) - reach * bar, seeds.max(axis=0) + reach * bar
             around = np.all((places > low) & (places < high), axis=1)
             discs = find_discs(places[around], left[around], bar)
             # Only a part of a hole of another group may lie in these surroundings.

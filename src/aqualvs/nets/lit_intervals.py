@@ -35,8 +35,8 @@ class LineState(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class NetSignal:
-    """Signals of the net along the lasers' lines in a frame; L lasers, J search lines (padded)."""
+class NetFrame:
+    """The lasers' lines on the net in one frame, L lasers."""
 
     # As in the `Scan`.
     index: int
@@ -53,6 +53,12 @@ class NetSignal:
     search: FloatArray
     # Size of a pixel on the net, in metres.
     pixel: float
+
+
+@dataclass(frozen=True, slots=True)
+class NetSignal(NetFrame):
+    """Signals of the net along the lasers' lines in a frame; J search lines (padded)."""
+
     # Shape (L, J): place on the laser's line in metres, ascending or descending; NaN where a search
     # line does not meet it.
     along: FloatArray

@@ -326,7 +326,10 @@ class _Nodes:
         time_s = np.array([stretches[0].begin_s, *(one.end_s for one in stretches)])
         raw = np.array([stretches[0].begin_place, *(one.place for one in stretches)])
         piece = np.array([0, *(one.piece for one in stretches)])
-        tracked = _tracked(stretches, raw, piece)
+        # Whether the track gives the length of each stretch.
+        moved = np.any(np.diff(raw, axis=0) != 0.0, axis=1)
+        seen_there = np.array([one.lattice is not None for one in stretches])
+        tracked = (np.diff(piece) == 0) & (moved | seen_there)
         run = np.concatenate([[0], np.cumsum(~tracked)])
         upright = seen.upright()
         steps = _steps(np.diff(raw, axis=0) * [1.0, upright], np.diff(time_s), tracked)
@@ -387,13 +390,6 @@ class _Nodes:
             heading=seen.heading(hole.time_s),
             placed_by=placed_by,
         )
-
-
-def _tracked(stretches: Sequence[NetStretch], raw: FloatArray, piece: IntArray) -> BoolArray:
-    """Return for every stretch whether the track gives its length."""
-    moved = np.any(np.diff(raw, axis=0) != 0.0, axis=1)
-    seen = np.array([one.lattice is not None for one in stretches])
-    return np.asarray((np.diff(piece) == 0) & (moved | seen), np.bool_)
 
 
 def _steps(steps: FloatArray, elapsed: FloatArray, tracked: BoolArray) -> FloatArray:

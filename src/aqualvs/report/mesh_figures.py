@@ -45,23 +45,6 @@ from aqualvs.terminal import Echo
 _ZONE = "#e8f3ea"
 
 
-class _PictureOptions(NamedTuple):
-    """Parts of the points that are drawn."""
-
-    detail: tuple[float, float] = (150.0, 75.0)  # Width and height of a detail, in mm.
-    # Stragglers beyond these quantiles do not set the scale of a picture.
-    stragglers: float = 0.005
-    batch: int = 1 << 16
-    # Frames have numbers of 32 bits, lasers of 8.
-    lasers: int = 1 << 8
-    # So many of the fullest frames and lasers are looked at; pieces of net are this far apart, in
-    # m.
-    candidates: int = 16
-    strand_gap: float = 4e-3
-
-
-_PICTURE = _PictureOptions()
-
 _RINGS = {"A": "#d55e00", "B": "#009e73", "C": "#7b3fb5"}
 _NAMES = ("adaptive filter", "paper's filter")
 
@@ -139,10 +122,11 @@ def _filtered(r: Reflections, options: MeshFilterOptions) -> Figure:
     width, height = (high - low).tolist()
     spare = max(0.55 * width - 1.14 * height, 0.0)
     low[1], high[1] = low[1] - 0.5 * spare, high[1] + 0.14 * height + 0.5 * spare
-    shape = min((high[1] - low[1]) / width, 1.3)
-    figure = new_canvas(7.2, 3.3 * (shape + _PICTURE.detail[1] / _PICTURE.detail[0]) + 1.5)
-    grid = figure.subplots(2, 2, height_ratios=[shape, _PICTURE.detail[1] / _PICTURE.detail[0]])
-    view = _detail(1e3 * r.in_laser[r.adaptive | r.paper], xy)
+    size = np.array([150.0, 75.0])  # Of a detail, in mm.
+    shapes = [min((high[1] - low[1]) / width, 1.3), size[1] / size[0]]
+    figure = new_canvas(7.2, 3.3 * sum(shapes) + 1.5)
+    grid = figure.subplots(2, 2, height_ratios=shapes)
+    view = _detail(1e3 * r.in_laser[r.adaptive | r.paper], xy, 0.5 * size)
     for column, (name, net) in enumerate(zip(_NAMES, (r.adaptive, r.paper), strict=True)):
         kept = 1e3 * r.in_laser[net & r.usable]
         axes = grid[0, column]
@@ -259,16 +243,15 @@ def _span(xy: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
     """Return the corners of a box around nearly all points, with a margin; 1 m² without any."""
     if not len(xy):
         return np.array([-500.0, 0.0]), np.array([500.0, 1000.0])
-    low = np.quantile(xy, _PICTURE.stragglers, axis=0)
-    high = np.quantile(xy, 1.0 - _PICTURE.stragglers, axis=0)
+    # Stragglers beyond these quantiles do not set the scale of a picture.
+    low, high = np.quantile(xy, [0.005, 0.995], axis=0)
     extra = margin * np.maximum(high - low, 50.0)
     return low - extra, high + extra
 
 
-def _detail(net: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the window that shows most of the net, wide enough for several meshes."""
+def _detail(net: FloatArray, others: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the window of half a size (2,) that shows most of the net."""
     xy = net if len(net) else others
-    half = 0.5 * np.array(_PICTURE.detail)
     if not len(xy):
         return -half, half
     inside = [np.count_nonzero(np.all(np.abs(xy - at) < half, axis=1)) for at in xy]
@@ -363,15 +346,17 @@ def _paper_options(folder: Path, run: Mapping[str, Any], target: Path | None) ->
 
 def _count(points: Path) -> _Counts:
     """Count net and other reflections, batch by batch, so that memory stays flat."""
+    # Frames have numbers of 32 bits, lasers of 8.
+    lasers = 1 << 8
     n_net, n_all = Counter[int](), Counter[int]()
-    for batch in stored_batches(points, _PICTURE.batch, ("frame", "laser", "label")):
+    for batch in stored_batches(points, 1 << 16, ("frame", "laser", "label")):
         frame = batch["frame"].to_numpy().astype(np.int64)
-        keys = frame * _PICTURE.lasers + batch["laser"].to_numpy()
+        keys = frame * lasers + batch["laser"].to_numpy()
         n_net.update(keys[_is_net(batch["label"])].tolist())
         n_all.update(keys.tolist())
     keys = np.array([*n_all], np.int64)
     counts = (np.array([n[key] for key in n_all], np.int64) for n in (n_net, n_all))
-    return _Counts(keys // _PICTURE.lasers, keys % _PICTURE.lasers, *counts)
+    return _Counts(keys // lasers, keys % lasers, *counts)
 
 
 def _is_net(label: Any) -> BoolArray:
@@ -397,8 +382,9 @@ def _candidates(
     # What shows only one of both shows nothing; of equals the fullest.
     worth = np.minimum(counts.n_net, counts.n_all - counts.n_net)[rows]
     best = rows[np.lexsort((counts.n_all[rows], worth))[::-1]]
-    found = [(int(counts.frame[row]), int(counts.laser[row])) for row in best]
-    return found[: _PICTURE.candidates]
+    # So many of the fullest are looked at.
+    candidates = 16
+    return [(int(counts.frame[row]), int(counts.laser[row])) for row in best[:candidates]]
 
 
 def _worth(r: Reflections) -> float:
@@ -407,7 +393,8 @@ def _worth(r: Reflections) -> float:
     A stripe along one strand shows no mesh, however long it is.
     """
     x = np.sort(r.in_laser[r.adaptive & r.usable, 0])
-    pieces = np.count_nonzero(np.diff(x) > _PICTURE.strand_gap)
+    strand_gap = 4e-3  # Distance of pieces of net, in metres.
+    pieces = np.count_nonzero(np.diff(x) > strand_gap)
     return float(pieces * np.sqrt(1.0 + np.count_nonzero(r.usable & ~r.adaptive)))
 
 

@@ -214,9 +214,9 @@ class RunOutputs:
             else:
                 self._export.finish()
             (self.folder / POINTS_STREAM).unlink()
-            self._run_file.write(
-                self._final_status(fault), error=_error_text(fault), summary=self.summary.to_dict()
-            )
+            error = "" if fault is None else f"{fault}" or type(fault).__name__
+            status, summary = self._final_status(fault), self.summary.to_dict()
+            self._run_file.write(status, error=error, summary=summary)
         except OSError as full:
             refusal = OutputError(explain(self.folder, full))
             self._abandon(refusal)
@@ -342,7 +342,3 @@ def _complete_run_file(folder: Path) -> None:
         "summary": summary_of(folder / POSTURE_CSV).to_dict(),
     }
     write_yaml(path, head | {key: value for key, value in content.items() if key not in known})
-
-
-def _error_text(fault: BaseException | None) -> str:
-    return "" if fault is None else f"{fault}" or type(fault).__name__
