@@ -168,10 +168,9 @@ class AlignedLog:
         found: dict[str, Any] = {"file": self.log.name, "used": self.places is not None}
         if isinstance(self.offset, OffsetRefusal):
             return found | {"refused": self.offset.reason}
-        digits = 3
         return found | {
-            "offset_s": round(self.offset.offset_s, digits),
-            "sigma_offset_s": round(self.offset.sigma_s, digits),
+            "offset_s": round(self.offset.offset_s, 3),
+            "sigma_offset_s": round(self.offset.sigma_s, 3),
             "offset_from": self.offset.how,
             "covered": round(self.covered, 4),
         }
@@ -334,13 +333,12 @@ class _Nodes:
         upright = seen.upright()
         steps = _steps(np.diff(raw, axis=0) * [1.0, upright], np.diff(time_s), tracked)
         along, up = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]).T
-        placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.SPEED for r in run]
-        if not tracked.any():
-            placed_by = [PlacedBy.NOTHING] * len(run)
-        turned = _place_round_cage(along, run, seen.bearings(time_s))
+        joined_by, turned = PlacedBy.SPEED, _place_round_cage(along, run, seen.bearings(time_s))
         if turned is not None:
-            along = turned
-            placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.BEARING for r in run]
+            along, joined_by = turned, PlacedBy.BEARING
+        placed_by = [joined_by if r else PlacedBy.TRACK for r in run]
+        if turned is None and not tracked.any():
+            placed_by = [PlacedBy.NOTHING] * len(run)
         depth = _log_corrected_depths(time_s, up, run, seen.depths(time_s))
         return cls(time_s, along, up, raw, piece, run, upright, depth, placed_by)
 
