@@ -107,17 +107,11 @@ def points_batch(*scans: Scan) -> Any:
     """Return the points of frames as a record batch of `POINTS_SCHEMA`."""
     points = [scan.points for scan in scans]
     counts = [len(one) for one in points]
-    numbers = np.empty((9, sum(counts)), np.float32)
-    end = 0
-    for one in points:
-        first, end = end, end + len(one)
-        mine = numbers[:, first:end]
-        mine[0:2] = one.pixels.T
-        mine[2:5] = one.points_in_dome.T
-        mine[5] = one.sigma
-        mine[6] = one.quality
-        mine[7] = one.intensity
-        mine[8] = one.width
+    rows = [
+        (*one.pixels.T, *one.points_in_dome.T, one.sigma, one.quality, one.intensity, one.width)
+        for one in points
+    ]
+    numbers = [np.concatenate(parts).astype(np.float32) for parts in zip(*rows, strict=True)]
     head = (
         np.repeat(np.array([scan.index for scan in scans], np.int32), counts),
         np.repeat(np.array([scan.time_s for scan in scans]), counts),
