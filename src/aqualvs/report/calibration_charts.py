@@ -42,11 +42,12 @@ def _figure(shot: PictureShot, index: int, count: int) -> str:
     all_bytes, max_bytes, all_marks = 340_000, 130_000, 6000
     address, width, height = _embedded(shot.image, min(max_bytes, all_bytes // count))
     scale = width / shot.image.shape[1]
-    body = [f'<image href="{address}" width="{width}" height="{height}"/>']
     limit = all_marks // count // max(len(shot.points), 1)
-    for layer, overlay in enumerate(shot.points):
-        name = f"marks-{index}-{layer}"
-        body.append(_marks(overlay, name, scale, width / 640.0, limit))
+    body = [f'<image href="{address}" width="{width}" height="{height}"/>']
+    body += [
+        _marks(overlay, f"marks-{index}-{layer}", scale, width / 640.0, limit)
+        for layer, overlay in enumerate(shot.points)
+    ]
     shown = ", ".join(overlay.label for overlay in shot.points if overlay.label)
     alt = f"{shot.caption}; drawn over it: {shown}" if shown else shot.caption
     picture = draw.svg(width, height, body, alt=alt, kind="picture")
@@ -87,13 +88,18 @@ def _marks(overlay: Overlay, name: str, scale: float, grown: float, limit: int) 
     places = (pixels[draw.sampled(len(pixels), limit)] + 0.5) * scale
     size, thin, wide = (grown * value for value in _SHAPES[overlay.kind])
     path = _path(places, overlay.kind, size)
-    layers = "".join(
-        f'<use href="#{name}" stroke="{colour}" stroke-width="{draw.num(width)}"/>'
-        for colour, width in ((_UNDER, wide), (escape(overlay.colour), thin))
-    )
+    layers = _edged(f'<use href="#{name}"', overlay.colour, draw.num(wide), draw.num(thin))
     return (
         f'<defs><path id="{name}" d="{path}"/></defs>'
         f'<g fill="none" stroke-linecap="round">{layers}</g>'
+    )
+
+
+def _edged(shape: str, colour: str, wide: object, thin: object) -> str:
+    """Return a shape, begun as an element, in its colour over a dark and wider one."""
+    return (
+        f'{shape} stroke="{_UNDER}" stroke-width="{wide}"/>'
+        f'{shape} stroke="{escape(colour)}" stroke-width="{thin}"/>'
     )
 
 
@@ -117,10 +123,7 @@ def _legend(points: Sequence[Overlay]) -> str:
 def _key(overlay: Overlay) -> str:
     size, thin, wide = _SHAPES[overlay.kind]
     path = _path(np.array([[9.0, 8.0]]), overlay.kind, size)
-    lines = "".join(
-        f'<path d="{path}" stroke="{colour}" stroke-width="{width}"/>'
-        for colour, width in ((_UNDER, wide), (escape(overlay.colour), thin))
-    )
+    lines = _edged(f'<path d="{path}"', overlay.colour, wide, thin)
     return (
         '<svg class="key square" viewBox="0 0 18 16" fill="none" stroke-linecap="round" '
         f'aria-hidden="true">{lines}</svg>'
@@ -382,13 +385,11 @@ def _vector_text(points: ResidualMap, drawn: int, cut: bool) -> str:
 
 
 def _vector_legend(outliers: bool) -> Raw:
-    shapes = [
-        (
-            f'<path d="M5 9h0" stroke-width="4" stroke-linecap="round" stroke="{draw.ACCENT}"/>'
-            f'<path d="M5 9L25 4" stroke="{draw.ACCENT}" stroke-width="1.4"/>',
-            "dot: measured point; line: its residual (measured minus predicted)",
-        )
-    ]
+    vector = (
+        f'<path d="M5 9h0" stroke-width="4" stroke-linecap="round" stroke="{draw.ACCENT}"/>'
+        f'<path d="M5 9L25 4" stroke="{draw.ACCENT}" stroke-width="1.4"/>'
+    )
+    shapes = [(vector, "dot: measured point; line: its residual (measured minus predicted)")]
     if outliers:
         cross = f'<path d="M9 2l8 8m0 -8l-8 8" stroke="{draw.OUTLIER}" stroke-width="1.7"/>'
         shapes.append((cross, "outlier, not used"))

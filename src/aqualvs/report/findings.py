@@ -16,17 +16,16 @@ from aqualvs.text import clock, count_text, sentence, signed
 
 def headline(track: Track) -> list[Card]:
     """Return the numbers at the top of the report."""
-    share = float(track.valid.mean())
-    valid = f"{int(track.valid.sum())} of {count_text(len(track), 'frame')}"
-    seconds, rate = float(track.time_s[-1] - track.time_s[0]), count_text(len(track), "frame")
-    if len(track) > 1 and seconds > 0.0:
-        rate += f", {(len(track) - 1) / seconds:.3g} per second"
+    share, frames = float(track.valid.mean()), count_text(len(track), "frame")
+    valid = f"{int(track.valid.sum())} of {frames}"
+    seconds = float(track.time_s[-1] - track.time_s[0])
+    rate = f", {(len(track) - 1) / seconds:.3g} per second" if seconds > 0.0 else ""
     cards = [
         _posture_card("Range", "mm", 0, track, scale=1e3, digits=1),
         _posture_card("Pitch", "°", 1, track, scale=1.0, digits=2),
         _posture_card("Yaw", "°", 2, track, scale=1.0, digits=2),
         Card("Frames with a posture", f"{100 * share:.1f} %", valid),
-        Card("Duration", clock(seconds), rate),
+        Card("Duration", clock(seconds), frames + rate),
     ]
     water = track.n_water[np.isfinite(track.n_water)]
     if len(water):

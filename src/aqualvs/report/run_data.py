@@ -243,16 +243,10 @@ def _words(column: Any, rows: BoolArray) -> _Words:
         return _Words(("None",), np.zeros(int(rows.sum()), np.int64))
     chunks = column.chunks
     found = np.concatenate([chunk.indices.to_numpy() for chunk in chunks])[rows]
-    occurs = np.bincount(found)
-    names = {
-        name: code
-        for code, name in enumerate(chunks[0].dictionary.to_pylist()[: len(occurs)])
-        if occurs[code]
-    }
-    ordered = tuple(sorted(names))
-    place = np.zeros(len(occurs), np.int64)
-    place[[names[name] for name in ordered]] = np.arange(len(ordered))
-    return _Words(ordered, place[found])
+    codes, place = np.unique(found, return_inverse=True)
+    names = [chunks[0].dictionary[code].as_py() for code in codes.tolist()]
+    order = sorted(range(len(names)), key=names.__getitem__)
+    return _Words(tuple(names[i] for i in order), np.argsort(order)[place])
 
 
 def _numbers(column: Any) -> FloatArray:

@@ -282,9 +282,7 @@ _MARKS = ("●", "■", "▲", "★", "□", "✕", "◆", "○")
 def _subtitle(run: Mapping[str, Any]) -> str:
     """Return the rig's name, the source and its picture size, as far as they are known."""
     rig, source = mapping(run, "rig"), run.get("source")
-    said = []
-    if rig.get("name"):
-        said.append(f"Rig “{rig['name']}”")
+    said = [f"Rig “{rig['name']}”"] if rig.get("name") else []
     if isinstance(source, dict):
         said.append(f"source {source.get('path') or source.get('name') or 'unknown'}")
         size = source.get("size_px") or [source.get("width_px"), source.get("height_px")]

@@ -180,10 +180,8 @@ def _scales(x_axis: Axis, y_axis: Axis, series: Series) -> list[str]:
     left, right, foot, head = x_axis.start, x_axis.end, y_axis.start, y_axis.end
     parts = []
     for y, words in y_axis.ticks(5):
-        parts += [
-            line(left, y, right, y, colour=GRID),
-            words_at(left - 8, y + 5, words, anchor="end"),
-        ]
+        parts.append(line(left, y, right, y, colour=GRID))
+        parts.append(words_at(left - 8, y + 5, words, anchor="end"))
     for x, words in x_axis.ticks(8):
         parts += [line(x, foot, x, foot + 5), words_at(x, foot + 21, words)]
     middle = 0.5 * (foot + head)
