@@ -129,10 +129,9 @@ class NetFacts:
         """Return the lengths of `MeshFilterOptions` that follow from the net, in metres."""
         least, greatest = (self.bar * share for share in _DISTANCES[self.mesh])
         lengths = {"r_min": least, "r_max": greatest}
-        # Reflection over twine, as for the paper's net (section 5.2).
-        reflection = 5.0
         if self.twine is not None:
-            lengths["rd_theta"] = min(reflection * self.twine, least)
+            # Reflection over twine, as for the paper's net (section 5.2).
+            lengths["rd_theta"] = min(5.0 * self.twine, least)
         return lengths
 
 
@@ -256,9 +255,7 @@ class NetCheck:
         found: dict[str, Any] = {"bar_said_mm": round(1e3 * self.said.bar, 2)}
         if bar is not None:
             found["bar_seen_mm"] = round(1e3 * bar, 1)
-        found["n_frames"] = len(self.bars)
-        found["words"] = self.sentence()
-        return found
+        return found | {"n_frames": len(self.bars), "words": self.sentence()}
 
 
 def net_check(target: str, rig: Rig) -> NetCheck | None:

@@ -339,13 +339,13 @@ def _frame_counts(track: Track) -> str:
 
 def _quality_places(points: PointSummary) -> list[tuple[str, str]]:
     """Return the charts on the quality of the points that there are: identifier and title."""
-    places = [
-        ("chart-counts", "Target points per frame and laser", points.on_target.any()),
-        ("chart-rms", "Residuals over time", points.n_squares.any()),
-        ("chart-residual", "Residuals by laser", points.residual.any()),
-        ("chart-quality", "Stripe quality of target points", points.quality.any()),
-    ]
-    return [(name, title) for name, title, known in places if known]
+    places = (
+        ("counts", "Target points per frame and laser", points.on_target),
+        ("rms", "Residuals over time", points.n_squares),
+        ("residual", "Residuals by laser", points.residual),
+        ("quality", "Stripe quality of target points", points.quality),
+    )
+    return [(f"chart-{name}", title) for name, title, counts in places if counts.any()]
 
 
 def _bare_ranges(track: Track, bare: FloatArray, housing: str) -> tuple[int, str]:
@@ -366,27 +366,20 @@ def _laser_rows(lasers: list[LaserFacts], centre: str) -> str:
     rows = []
     for index, laser in enumerate(lasers):
         bent = " (bent sheet; the plane that fits it)" if laser.bent else ""
-        cells = ["–"] * 4
-        if np.isfinite(laser.offset):
-            cells = [signed(f"{v:+.5f}") for v in laser.normal]
-            cells.append(signed(f"{1e3 * laser.offset:.2f}"))
+        cells = [*(f"{v:+.5f}" for v in laser.normal), f"{1e3 * laser.offset:.2f}"]
+        cells = [signed(cell) if np.isfinite(laser.offset) else "–" for cell in cells]
         rows.append((html.Raw(html.swatch(index) + escape(laser.name + bent)), *cells))
     return html.table(head, rows)
 
 
 def _fact_blocks(run: Mapping[str, Any]) -> list[tuple[str, html.Raw]]:
     """Return rig, options and versions as tables with their titles."""
-    blocks = []
-    for title, key, skip in (
-        ("Rig", "rig", ("lasers", "solved_from", "points", "history")),
-        ("Source", "source", ()),
-        ("Options", "options", ()),
-        ("Versions", "versions", ()),
-        ("Summary", "summary", ("warnings",)),
-    ):
-        if content := mapping(run, key):
-            blocks.append((title, html.fact_table(facts(content, skip))))
-    return blocks
+    left_out = {"rig": ("lasers", "solved_from", "points", "history"), "summary": ("warnings",)}
+    return [
+        (key.capitalize(), html.fact_table(facts(content, left_out.get(key, ()))))
+        for key in ("rig", "source", "options", "versions", "summary")
+        if (content := mapping(run, key))
+    ]
 
 
 def _laser_counts(points: PointSummary, names: list[str]) -> str:
