@@ -352,15 +352,9 @@ def _on_wall(
         warnings.append("places are not compared, only whole dives: fewer than two dates are left")
         return None, warnings
     wall = history(placed, shifts, frame, cell)
+    changes = cell_changes(wall), wall_growth(wall), date_means(wall)
     return OnWall(
-        frame,
-        placed,
-        shifts,
-        wall,
-        cell_changes(wall),
-        wall_growth(wall),
-        date_means(wall),
-        find_sites(placed, shifts, frame),
+        frame, placed, shifts, wall, *changes, find_sites(placed, shifts, frame)
     ), warnings
 
 
@@ -404,8 +398,8 @@ def _rate(dates: Sequence[date], whole: Sequence[Growth | None]) -> Growth | Non
 
 def _warnings(surveys: Sequence[Survey]) -> list[str]:
     found = []
-    bars = [one.facts.get("summary", {}).get("bar_mm") for one in surveys]
-    known = [bar for bar in bars if isinstance(bar, int | float)]
+    summaries = [one.facts.get("summary", {}) for one in surveys]
+    known = [s["bar_mm"] for s in summaries if isinstance(s.get("bar_mm"), int | float)]
     # Dives along nets whose bars differ by so much, as a share, are hardly of one net.
     other_net = 0.1
     if known and max(known) > (1.0 + other_net) * min(known):
@@ -419,8 +413,8 @@ def _warnings(surveys: Sequence[Survey]) -> list[str]:
             "--twine-mm differs between runs, or was given for some only: solidity may differ for "
             "that reason alone"
         )
-    for one in surveys:
-        slip = one.facts.get("summary", {}).get("track_slip_m")
+    for one, summary in zip(surveys, summaries, strict=True):
+        slip = summary.get("track_slip_m")
         if isinstance(slip, int | float) and slip > 0.0:
             found.append(
                 f"{one.folder}: its track and its log differ by {slip:.1f} m in depth; its places "

@@ -249,12 +249,9 @@ def date_means(wall: WallHistory) -> list[Growth | None]:
     common = common_cells(wall)
     if not common.any():
         return [None] * len(wall.dates)
-    found: list[Growth | None] = []
-    for v in range(len(wall.dates)):
-        factors = np.zeros(wall.solidity.shape)
-        factors[common, v] = 1.0 / np.count_nonzero(common)
-        found.append(wall.estimate(factors))
-    return found
+    share = common[:, None] / np.count_nonzero(common)
+    of_dates = np.eye(len(wall.dates))
+    return [wall.estimate(share * of_date) for of_date in of_dates]
 
 
 def _wall_factors(wall: WallHistory) -> FloatArray:

@@ -36,10 +36,8 @@ N_SAMPLES = 24
 _BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
 # Colour at full resolution, else the lasers' colours bleed into the green stripes below.
 _JPEG = (
-    cv2.IMWRITE_JPEG_QUALITY,
-    80,
-    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    *(cv2.IMWRITE_JPEG_QUALITY, 80),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
 )
 _HOLE_COLOUR = bgr("#ffb347")
 
@@ -116,9 +114,8 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
     scale = min(1.0, width_px / image.shape[1])
     small = image
     if scale < 1.0:
-        small = np.asarray(
-            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
-        )
+        resized = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = np.asarray(resized, np.uint8)
     if points is not None:
         pixels = (points.pixels + 0.5) * scale - 0.5
         small = draw_points(small, points.laser, pixels, points.used)
