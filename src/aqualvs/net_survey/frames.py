@@ -334,7 +334,9 @@ def shifted(one: PlacedSurvey, shift: SurveyShift) -> PlacedSurvey:
 
 def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame) -> ShiftGrid:
     sigma = prior_sigma(frame)
-    reach, max_shifts = np.minimum(3.0 * sigma, 0.5 * frame.period), 40_000
+    # Shifts up to this many prior deviations are tried, up to this number.
+    deviations, max_shifts = 3.0, 40_000
+    reach = np.minimum(deviations * sigma, 0.5 * frame.period)
     centre = 0.0
     if not frame.round:
         known = np.concatenate([one.outline.reshape(-1, 2) for one in earlier])[:, 0]

@@ -268,11 +268,11 @@ def dash_kinds(lattice: NetLattice, frames: Sequence[RegisteredView]) -> list[Da
     table = np.concatenate([np.empty((0, 9)), *rows])
     kinds = np.unique(table[:, :2], axis=0)
     each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
-    min_dashes, slanted, usual_spread = 6, 1.5, 0.15
+    min_dashes, slanted, usual_spread, short, long = 6, 1.5, 0.15, 0.25, 0.7
     each = [mine for mine in each if len(mine) >= min_dashes]
     # Long dashes against short ones; on slanted strands the light sheet evens them out.
     even = [mine for mine in each if np.median(mine[:, 3]) < slanted]
-    spreads = [np.log(_length_at(mine, 0.7) / _length_at(mine, 0.25)) for mine in even]
+    spreads = [np.log(_length_at(mine, long) / _length_at(mine, short)) for mine in even]
     spread = float(np.median(spreads)) if spreads else usual_spread
     return [_kind(mine, spread) for mine in each]
 
@@ -370,7 +370,8 @@ def measure_solidity(
     if not np.all(np.any(counts & (seen.sum(axis=0) > 0.0)[:, None], axis=0)):
         return None
     solidity = _family_sum(body, seen, counts)
-    blocks = np.array_split(np.arange(len(frames)), min(6, len(frames)))
+    n_blocks = min(6, len(frames))
+    blocks = np.array_split(np.arange(len(frames)), n_blocks)
     parts = [_family_sum(body[b], seen[b], counts) for b in blocks]
     chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
     # Errors for dashes that run together or are not seen, as shares: of any net, and per pixel in

@@ -161,7 +161,7 @@ class HoleMap:
 
     def _near(self, places: FloatArray) -> BoolArray:
         """Mark the places (..., 2) in the part of the map that is not settled."""
-        settled = 2.0  # In metres.
+        settled = 2.0  # What is farther from the vehicle is settled, in metres.
         return np.asarray(np.abs(places - self._last).max(axis=-1) < settled)
 
     def _find(self, lattice: NetLattice) -> list[Hole]:
