@@ -35,12 +35,7 @@ def leave_maps_blank(patch: pytest.MonkeyPatch) -> None:
 
 def lattice(bar=0.025):
     return NetLattice(
-        mesh=Mesh.FOUR_SIDED,
-        bar=bar,
-        sigma_bar=2e-4,
-        waves=np.eye(2) / bar,
-        score=3.0,
-        density=np.ones(2),
+        mesh=Mesh.FOUR_SIDED, bar=bar, sigma_bar=2e-4, waves=np.eye(2) / bar, score=3.0
     )
 
 

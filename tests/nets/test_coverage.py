@@ -12,7 +12,7 @@ from aqualvs.nets.lit_intervals import NetSignal
 from aqualvs.nets.spectrum import Mesh
 
 BAR, STEP, HALF, HEIGHT, PIXEL = 0.05, 5e-4, 0.4, 100.0, 6e-4
-NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0, np.ones(2))
+NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0)
 TURN = np.deg2rad(40.0)
 # Body 2.4 mm, halo 0.6 mm and a share of a step of the search lines.
 TWINE = Twine(2.5e-3, 2e-4, 2.4e-3, 3e-3, 0.6e-3, 2e-4)

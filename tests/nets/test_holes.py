@@ -13,7 +13,7 @@ from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
 
 BAR, HALF = 0.025, 0.2
-NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0, np.ones(2))
+NET = NetLattice(Mesh.FOUR_SIDED, BAR, 1e-4, np.eye(2) / BAR, 5.0)
 
 
 def _dark(view: NetView, strands: Strands, which: BoolArray) -> NetView:
@@ -154,7 +154,7 @@ def test_openings_of_hexagons_are_not_missed_bars() -> None:
     a = np.array([0.0, 1.0 / (1.5 * BAR)])
     b = np.array([np.sqrt(0.75) * a[1], 0.5 * a[1]])
     families = np.array([a + b, 2.0 * b - a, 2.0 * a - b])
-    net = NetLattice(Mesh.SIX_SIDED, BAR, 1e-4, families, 5.0, np.full(3, 1.0 / 3.0))
+    net = NetLattice(Mesh.SIX_SIDED, BAR, 1e-4, families, 5.0)
     np.testing.assert_allclose(net.basis, [a, b], atol=1e-9)
     dark = view_at(np.zeros(2), hole=(0.0, 0.0, 1.0))
     rng = np.random.default_rng(2)
@@ -280,7 +280,7 @@ def test_the_dim_end_of_a_line_is_no_hole(share: float) -> None:
 
 
 def test_a_finer_lattice_than_the_nets_has_no_holes() -> None:
-    fine = NetLattice(Mesh.FOUR_SIDED, BAR / 3.0, 1e-4, 3.0 * np.eye(2) / BAR, 5.0, np.ones(2))
+    fine = NetLattice(Mesh.FOUR_SIDED, BAR / 3.0, 1e-4, 3.0 * np.eye(2) / BAR, 5.0)
     holes = HoleMap()
     for i in range(60):
         foot = i * 8e-3 * np.array([1.0, 0.5])

@@ -20,6 +20,7 @@ from aqualvs.net_survey.frames import (
     WallFrame,
     align,
     common_frame,
+    corners_of,
     has_places,
     looked_at,
     place_survey,
@@ -197,47 +198,39 @@ def _counterparts(distance: FloatArray, group: IntArray) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class _Visits:
-    """Places that the lasers of each dive looked at, with their uncertainty."""
+    """Places that the lasers of each dive looked at, with the date and their uncertainty."""
 
     raster: Raster
-    seen: list[BoolArray]
-    sigma: list[FloatArray]
-    visit: list[int]
+    n_dates: int
+    dives: list[tuple[BoolArray, int, FloatArray]]
 
     @classmethod
     def of(
         cls, placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame
     ) -> "_Visits":
-        corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])
-        low, high = corners.min(axis=0), corners.max(axis=0)
+        low, high = corners_of(placed)
         max_squares = 4_000_000
         side = max(_SIDE, float(np.sqrt(np.prod(high - low) / max_squares)))
         raster = Raster.over(low, high, side, frame)
         dates = sorted({one.survey.date for one in placed})
-        return cls(
-            raster,
-            [looked_at(one, raster) for one in placed],
-            [np.hypot(a.sigma, b.sigma) for a, b in zip(placed, shifts, strict=True)],
-            [dates.index(one.survey.date) for one in placed],
-        )
+        dives = [
+            (looked_at(a, raster), dates.index(a.survey.date), np.hypot(a.sigma, b.sigma))
+            for a, b in zip(placed, shifts, strict=True)
+        ]
+        return cls(raster, len(dates), dives)
 
-    def chance(self, place: FloatArray, sigma: FloatArray, n_dates: int) -> FloatArray:
+    def chance(self, place: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return with what chance (V,) a place was looked at on each date."""
-        found = np.zeros(n_dates)
-        for seen, own, visit in zip(self.seen, self.sigma, self.visit, strict=True):
-            at = place + _normal_samples() * np.hypot(sigma, own)
-            index = self.raster.index(at)
+        found = np.zeros(self.n_dates)
+        # Spread like a normal distribution, always the same ones.
+        n = 16
+        at = ndtri((np.arange(n) + 0.5) / n)
+        samples = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+        for seen, visit, own in self.dives:
+            index = self.raster.index(place + samples * np.hypot(sigma, own))
             share = float(np.mean(np.where(index >= 0, seen[index], False)))
             found[visit] = max(found[visit], share)
         return found
-
-
-def _normal_samples() -> FloatArray:
-    """Return places (n, 2) spread like a normal distribution, always the same ones."""
-    draws = 256
-    n = int(np.sqrt(draws))
-    at = ndtri((np.arange(n) + 0.5) / n)
-    return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
 
 
 def _site(
@@ -260,8 +253,9 @@ def _site(
         # A dive sees too little of a hole, never too much: of one date the largest counts.
         if not size <= sizes[visit]:
             sizes[visit], errors[visit] = size, float(np.linalg.norm(holes.sigma[numbers]))
-    looked = visits.chance(place[best], sigma[best], n_dates)
+    looked = visits.chance(place[best], sigma[best])
     looked[np.isfinite(sizes)] = 1.0
+    runs = [(placed[parts[k][0]].survey, parts[k][1]) for k in mine]
     return Site(
         state=_state(sizes, errors, looked),
         place=place[best],
@@ -269,10 +263,7 @@ def _site(
         sizes=sizes,
         sigma_sizes=errors,
         looked=looked,
-        numbers=[
-            f"{placed[parts[k][0]].survey.name}:{placed[parts[k][0]].survey.holes.number[parts[k][1]]}"
-            for k in mine
-        ],
+        numbers=[f"{one.name}:{one.holes.number[i]}" for one, i in runs],
     )
 
 
@@ -320,15 +311,7 @@ class Comparison:
 
 
 def compare(surveys: Sequence[Survey], cell: float) -> Comparison:
-    """Compare dives along the same net.
-
-    Parameters
-    ----------
-    surveys : sequence
-        Of two dates or more.
-    cell : float
-        Side of the cells in metres.
-    """
+    """Compare dives along the same net, of two dates or more, by cells of a side in metres."""
     ordered = sorted(surveys, key=lambda one: (one.date, one.name))
     dates = sorted({one.date for one in ordered})
     whole = [_mean_solidity(one for one in ordered if one.date == day) for day in dates]
@@ -369,15 +352,9 @@ def _on_wall(
         warnings.append("places are not compared, only whole dives: fewer than two dates are left")
         return None, warnings
     wall = history(placed, shifts, frame, cell)
+    changes = cell_changes(wall), wall_growth(wall), date_means(wall)
     return OnWall(
-        frame,
-        placed,
-        shifts,
-        wall,
-        cell_changes(wall),
-        wall_growth(wall),
-        date_means(wall),
-        find_sites(placed, shifts, frame),
+        frame, placed, shifts, wall, *changes, find_sites(placed, shifts, frame)
     ), warnings
 
 
@@ -421,8 +398,8 @@ def _rate(dates: Sequence[date], whole: Sequence[Growth | None]) -> Growth | Non
 
 def _warnings(surveys: Sequence[Survey]) -> list[str]:
     found = []
-    bars = [one.facts.get("summary", {}).get("bar_mm") for one in surveys]
-    known = [bar for bar in bars if isinstance(bar, int | float)]
+    summaries = [one.facts.get("summary", {}) for one in surveys]
+    known = [s["bar_mm"] for s in summaries if isinstance(s.get("bar_mm"), int | float)]
     # Dives along nets whose bars differ by so much, as a share, are hardly of one net.
     other_net = 0.1
     if known and max(known) > (1.0 + other_net) * min(known):
@@ -436,8 +413,8 @@ def _warnings(surveys: Sequence[Survey]) -> list[str]:
             "--twine-mm differs between runs, or was given for some only: solidity may differ for "
             "that reason alone"
         )
-    for one in surveys:
-        slip = one.facts.get("summary", {}).get("track_slip_m")
+    for one, summary in zip(surveys, summaries, strict=True):
+        slip = summary.get("track_slip_m")
         if isinstance(slip, int | float) and slip > 0.0:
             found.append(
                 f"{one.folder}: its track and its log differ by {slip:.1f} m in depth; its places "

@@ -166,6 +166,11 @@ class Raster:
     periodic: bool  # Whether u goes round.
 
     @classmethod
+    def around(cls, dives: Sequence[PlacedSurvey], side: float, frame: WallFrame) -> "Raster":
+        """Cover what dives passed over with squares of about a side."""
+        return cls.over(*corners_of(dives), side, frame)
+
+    @classmethod
     def over(cls, low: FloatArray, high: FloatArray, side: float, frame: WallFrame) -> "Raster":
         """Cover a rectangle with squares of about a side; their edges are multiples of it."""
         size = np.array([side, side])
@@ -198,17 +203,18 @@ class Raster:
         return np.asarray(self.low + (np.stack([column, row], axis=-1) + 0.5) * self.size)
 
 
+def corners_of(dives: Sequence[PlacedSurvey]) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the greatest u and d, shape (2,) each, that dives passed over."""
+    corners = np.concatenate([one.outline.reshape(-1, 2) for one in dives])
+    return corners.min(axis=0), corners.max(axis=0)
+
+
 def spread_over(outline: FloatArray, side: float, share: float = 1.0) -> FloatArray:
     """Return places (K, n, 2) that fill outlines (K, 4, 2) evenly.
 
-    Parameters
-    ----------
-    outline : array, shape (K, 4, 2)
-        Corners in turn, beginning with an edge along the way.
-    side : float
-        Places are no farther apart than this, unless the outline is very large.
-    share : float
-        Of the width across the way, about the middle.
+    Corners are in turn, beginning with an edge along the way. Places are no farther apart than
+    `side`, unless the outline is very large. `share`: of the width across the way, about the
+    middle, that is filled.
     """
     if not len(outline):
         return np.empty((0, 1, 2))
@@ -246,26 +252,11 @@ PRIOR_BEARING, PRIOR_DEPTH = np.deg2rad(5.0), 0.5
 
 
 class _AlignmentOptions(NamedTuple):
-    """Alignment of a dive with earlier ones: shifts that are tried, and evidence for one."""
+    """Alignment of a dive with earlier ones by the pattern of growth."""
 
-    reach: float = 3.0
-    # A shift is determined if so much of the chance lies so near (prior deviations, and metres).
-    mass: float = 0.95
-    near: float = 0.5
-    min_near: float = 0.3
-    flat_near: float = 0.5
     # Places this far apart in a pattern of growth count as independent.
     pattern: float = 0.7
     min_stretches: int = 8
-    min_overlap: float = 0.5
-    # A hole is still there with this chance. Its diameter is then mostly found again to the first
-    # factor (log), else, seen in part, to the second, by which diameters of any holes differ.
-    kept: float = 0.5
-    seen_alike: float = 0.7
-    size: float = 0.15
-    sizes: float = 0.5
-    clip: float = 3.0
-    max_shifts: int = 40_000
 
 
 _ALIGNMENT = _AlignmentOptions()
@@ -293,8 +284,7 @@ class SurveyShift:
         return cls(np.zeros(2), np.zeros(2), np.ones(2, np.bool_))
 
 
-@dataclass(frozen=True, slots=True)
-class ShiftGrid:
+class ShiftGrid(NamedTuple):
     """Grid of the shifts that are tried."""
 
     steps: tuple[FloatArray, FloatArray]  # In u and d, as multiples of `STEP`.
@@ -317,17 +307,16 @@ def align(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
     chance = np.exp(log_chance - log_chance.max())
     chance /= chance.sum()
     value, spread, determined = np.zeros(2), sigma.copy(), np.zeros(2, np.bool_)
+    # A shift is determined if so much of the chance lies so near: in metres along a flat net, else
+    # in prior deviations, and at least so many metres.
+    min_mass, flat_near, near_share, min_near = 0.95, 0.5, 0.5, 0.3
     for axis in range(2):
-        near = (
-            max(_ALIGNMENT.near * sigma[axis], _ALIGNMENT.min_near)
-            if np.isfinite(sigma[axis])
-            else _ALIGNMENT.flat_near
-        )
+        near = max(near_share * sigma[axis], min_near) if np.isfinite(sigma[axis]) else flat_near
         shifts = STEP * grid.steps[axis]
         marginal = chance.sum(axis=1 - axis)
         inside = np.abs(shifts - shifts[np.argmax(marginal)]) <= near
         mass = float(marginal[inside].sum())
-        if mass < _ALIGNMENT.mass:
+        if mass < min_mass:
             continue
         determined[axis] = True
         value[axis] = marginal[inside] @ shifts[inside] / mass
@@ -345,7 +334,9 @@ def shifted(one: PlacedSurvey, shift: SurveyShift) -> PlacedSurvey:
 
 def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame) -> ShiftGrid:
     sigma = prior_sigma(frame)
-    reach = np.minimum(_ALIGNMENT.reach * sigma, 0.5 * frame.period)
+    # Shifts up to this many prior deviations are tried, up to this number.
+    deviations, max_shifts = 3.0, 40_000
+    reach = np.minimum(deviations * sigma, 0.5 * frame.period)
     centre = 0.0
     if not frame.round:
         known = np.concatenate([one.outline.reshape(-1, 2) for one in earlier])[:, 0]
@@ -354,7 +345,7 @@ def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
         centre, reach[0] = 0.5 * (least + most), 0.5 * (most - least)
     n = np.ceil(reach / STEP)
     depths = np.arange(-n[1], n[1] + 1)
-    n[0] = min(n[0], _ALIGNMENT.max_shifts // len(depths) // 2)
+    n[0] = min(n[0], max_shifts // len(depths) // 2)
     across = np.round(centre / STEP) + np.arange(-n[0], n[0] + 1)
     log_prior = -0.5 * (STEP * depths / sigma[1]) ** 2 + np.zeros((len(across), 1))
     if frame.round:
@@ -387,7 +378,8 @@ def _pattern_gain(
                 best, best_theirs = value, theirs
     if best_theirs is None:
         return nothing
-    agreement[(agreement < 0.0) | (count < _ALIGNMENT.min_overlap * count.max())] = 0.0
+    min_overlap = 0.5
+    agreement[(agreement < 0.0) | (count < min_overlap * count.max())] = 0.0
     gain = -0.5 * count * np.log1p(-(np.minimum(agreement, 0.9999) ** 2))
     alike, rest = _independent_shares(mine, best_theirs, later.outline.mean(axis=1))
     n_shifts = max(grid.log_prior.size * (STEP / _ALIGNMENT.pattern) ** 2, 1.0)
@@ -400,8 +392,7 @@ def _pattern_gain(
 
 def _pattern(earlier: Sequence[PlacedSurvey], frame: WallFrame) -> tuple[Raster, FloatArray]:
     """Return the solidity of earlier dives less their median, NaN where they have not been."""
-    corners = np.concatenate([one.outline.reshape(-1, 2) for one in earlier])
-    raster = Raster.over(corners.min(axis=0), corners.max(axis=0), STEP, frame)
+    raster = Raster.around(earlier, STEP, frame)
     total, weight = np.zeros(raster.n), np.zeros(raster.n)
     for one in earlier:
         if not len(one.rows):
@@ -430,7 +421,8 @@ def _clipped(values: FloatArray) -> FloatArray:
     """Return values with outliers drawn in."""
     middle = np.median(values)
     spread = max(_MAD * float(np.median(np.abs(values - middle))), 1e-6)
-    return np.clip(values, middle - _ALIGNMENT.clip * spread, middle + _ALIGNMENT.clip * spread)
+    clip = 3.0
+    return np.clip(values, middle - clip * spread, middle + clip * spread)
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> float:
@@ -486,6 +478,7 @@ def _holes_gain(
     later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame, grid: ShiftGrid
 ) -> FloatArray:
     """Return by how much each shift explains the later holes better than if all were new."""
+    kept = 0.5  # Chance that a hole is still there.
     gain = np.zeros(grid.log_prior.shape)
     parts = [(one, k) for one in earlier for k in range(len(one.holes))]
     if not parts or not len(later.holes):
@@ -493,8 +486,8 @@ def _holes_gain(
     known = np.array([one.holes[k] for one, k in parts])
     size = np.array([one.survey.holes.diameter[k] for one, k in parts])
     spread = np.array([one.sigma for one, _ in parts])
-    corners = np.concatenate([one.outline.reshape(-1, 2) for one in earlier])
-    area = max(float(np.prod(np.ptp(corners, axis=0))), 1.0)
+    low, high = corners_of(earlier)
+    area = max(float(np.prod(high - low)), 1.0)
     shift = np.stack(np.meshgrid(*(STEP * s for s in grid.steps), indexing="ij"), axis=-1)
     for place, diameter in zip(later.holes, later.survey.holes.diameter, strict=True):
         density = np.zeros(gain.shape)
@@ -504,16 +497,15 @@ def _holes_gain(
             variance = sigma**2 + later.sigma**2 + middle**2 + STEP**2 / 4.0
             peak = _size_gain(diameter, other) / (2.0 * np.pi * np.sqrt(np.prod(variance)))
             density += peak * np.exp(-0.5 * (off**2 / variance).sum(axis=-1))
-        gain += np.log((1.0 - _ALIGNMENT.kept) + _ALIGNMENT.kept * density * area / len(known))
+        gain += np.log((1.0 - kept) + kept * density * area / len(known))
     return gain
 
 
 def _size_gain(one: float, other: float) -> float:
     """Return how much more likely two diameters are those of one hole than of any two."""
+    # A diameter is mostly found again to the first factor (log), else, seen in part, to the second,
+    # by which diameters of any holes differ.
+    size, sizes, seen_alike = 0.15, 0.5, 0.7
     off = float(np.log(one / other))
-    again = (
-        _ALIGNMENT.sizes
-        / _ALIGNMENT.size
-        * np.exp(-0.5 * off**2 * (_ALIGNMENT.size**-2 - _ALIGNMENT.sizes**-2))
-    )
-    return _ALIGNMENT.seen_alike * float(again) + 1.0 - _ALIGNMENT.seen_alike
+    again = sizes / size * np.exp(-0.5 * off**2 * (size**-2 - sizes**-2))
+    return seen_alike * float(again) + 1.0 - seen_alike

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.net_survey.frames import PlacedSurvey, Raster, SurveyShift, WallFrame, spread_over
+from aqualvs.net_survey.surveys import areas
 
 SIGMA_SCALE = 1.4
 """By which sigmas of solidity are too small (docs/net-condition.md)."""
@@ -101,12 +102,8 @@ class WallHistory:
     def variance_of(self, value: float, of_stretches: FloatArray, place: float) -> Growth:
         """Return a sum with its standard deviation.
 
-        Parameters
-        ----------
-        of_stretches : array, shape (K,)
-            Factors of the stretches times their sigmas.
-        place : float
-            Variance for the places.
+        `of_stretches`, shape (K,): factors of the stretches times their sigmas. `place`: variance
+        for the places.
         """
         own = (1.0 - COMMON) * float(of_stretches @ of_stretches)
         of_dives = np.bincount(self.dive, of_stretches)
@@ -117,27 +114,42 @@ class WallHistory:
 def history(
     placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame, cell: float
 ) -> WallHistory:
-    """Lay dives, already shifted, over cells.
+    """Lay dives, already shifted, over cells with sides of `cell` metres.
 
-    Parameters
-    ----------
-    shifts : sequence
-        What each shift leaves open is in its sigma.
-    cell : float
-        Side of a cell in metres.
+    What each shift leaves open is in its sigma.
     """
     dates = sorted({one.survey.date for one in placed})
-    corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])
-    raster = Raster.over(corners.min(axis=0), corners.max(axis=0), cell, frame)
-    parts, centres, open_shift = [], [], np.zeros((len(dates), 2))
+    raster = Raster.around(placed, cell, frame)
+    n_cells, n_dates, blocks = raster.n, len(dates), []
+    cover, seen = np.zeros((2, n_cells, n_dates))
+    offset, open_shift = np.zeros((n_cells, n_dates, 2)), np.zeros((n_dates, 2))
     for one, shift in zip(placed, shifts, strict=True):
         visit = dates.index(one.survey.date)
-        rows, share, centre = _shares(one, raster)
-        parts.append((visit, rows, share))
-        centres.append(centre)
+        area, share, sums = _shares(one, raster)
+        length = one.survey.stretches.seen[one.rows]
+        cover[:, visit] += share @ area
+        seen[:, visit] += share @ length
+        offset[:, visit] += sums
         open_shift[visit] = np.maximum(open_shift[visit], np.hypot(shift.sigma, one.sigma))
-    lengths = [one.survey.stretches.seen[one.rows] for one in placed]
-    return _assemble(dates, raster, placed, parts, centres, lengths, open_shift)
+        coo = sparse.coo_array(share @ sparse.diags_array(length))
+        at = (coo.row * n_dates + visit, coo.col)
+        blocks.append(sparse.coo_array((coo.data, at), shape=(n_cells * n_dates, len(area))))
+    known = (cover >= _MIN_COVER * np.prod(raster.size)) & (seen > 0.0)
+    scale = np.where(known, 1.0 / np.where(known, seen, 1.0), 0.0).ravel()
+    weights = sparse.csr_array(sparse.diags_array(scale) @ sparse.hstack(blocks).tocsr())
+    values = np.concatenate([one.solidity for one in placed])
+    solidity = np.where(known, (weights @ values).reshape(n_cells, n_dates), np.nan)
+    offset = np.where(known[..., None], offset / np.maximum(cover, 1e-9)[..., None], np.nan)
+    return WallHistory(
+        dates=dates,
+        raster=raster,
+        solidity=solidity,
+        seen=np.where(known, seen, 0.0),
+        place_variance=_place_variance(raster, solidity, offset, open_shift),
+        weights=weights,
+        sigma=SIGMA_SCALE * np.concatenate([p.survey.stretches.sigma[p.rows] for p in placed]),
+        dive=np.repeat(np.arange(len(placed)), [len(p.rows) for p in placed]),
+    )
 
 
 def _shares(one: PlacedSurvey, raster: Raster) -> tuple[FloatArray, sparse.csr_array, FloatArray]:
@@ -150,8 +162,7 @@ def _shares(one: PlacedSurvey, raster: Raster) -> tuple[FloatArray, sparse.csr_a
     share = sparse.csr_array(
         (np.full(len(flat), 1.0 / n), (flat, stretch)), shape=(raster.n, count)
     )
-    x, y = one.outline[..., 0], one.outline[..., 1]
-    area = 0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1))
+    area = areas(one.outline)
     middle = raster.middle(flat)
     inner = places.reshape(-1, 2)[inside] - middle
     if raster.periodic:
@@ -159,45 +170,7 @@ def _shares(one: PlacedSurvey, raster: Raster) -> tuple[FloatArray, sparse.csr_a
         inner[:, 0] -= period * np.round(inner[:, 0] / period)
     weight = (area[stretch] / n)[:, None] * inner
     sums: FloatArray = np.stack([np.bincount(flat, w, raster.n) for w in weight.T], axis=-1)
-    return np.asarray(area, np.float64), share, sums
-
-
-def _assemble(
-    dates: list[date],
-    raster: Raster,
-    placed: Sequence[PlacedSurvey],
-    parts: Sequence[tuple[int, FloatArray, sparse.csr_array]],
-    centres: Sequence[FloatArray],
-    lengths: Sequence[FloatArray],
-    open_shift: FloatArray,
-) -> WallHistory:
-    n_cells, n_dates = raster.n, len(dates)
-    cover, seen = np.zeros((n_cells, n_dates)), np.zeros((n_cells, n_dates))
-    offset = np.zeros((n_cells, n_dates, 2))
-    blocks = []
-    for (visit, area, share), sums, length in zip(parts, centres, lengths, strict=True):
-        cover[:, visit] += share @ area
-        seen[:, visit] += share @ length
-        offset[:, visit] += sums
-        coo = sparse.coo_array(share @ sparse.diags_array(length))
-        blocks.append(
-            sparse.coo_array(
-                (coo.data, (coo.row * n_dates + visit, coo.col)),
-                shape=(n_cells * n_dates, share.shape[1]),
-            )
-        )
-    known = (cover >= _MIN_COVER * np.prod(raster.size)) & (seen > 0.0)
-    scale = np.where(known, 1.0 / np.where(known, seen, 1.0), 0.0).ravel()
-    weights = sparse.csr_array(sparse.diags_array(scale) @ sparse.hstack(blocks).tocsr())
-    values = np.concatenate([one.solidity for one in placed])
-    solidity = np.where(known, (weights @ values).reshape(n_cells, n_dates), np.nan)
-    offset = np.where(known[..., None], offset / np.maximum(cover, 1e-9)[..., None], np.nan)
-    sigma = SIGMA_SCALE * np.concatenate([p.survey.stretches.sigma[p.rows] for p in placed])
-    dive = np.repeat(np.arange(len(placed)), [len(p.rows) for p in placed])
-    place = _place_variance(raster, solidity, offset, open_shift)
-    return WallHistory(
-        dates, raster, solidity, np.where(known, seen, 0.0), place, weights, sigma, dive
-    )
+    return area, share, sums
 
 
 def _place_variance(
@@ -220,23 +193,17 @@ def _slope(raster: Raster, solidity: FloatArray) -> FloatArray:
     wall = mean.reshape(raster.shape)
     found = np.empty((*raster.shape, 2))
     for axis in range(2):
-        around = np.roll(wall, -1, axis=axis), np.roll(wall, 1, axis=axis)
-        if not (axis == 0 and raster.periodic):
-            _unknown(around[0], axis, -1)
-            _unknown(around[1], axis, 0)
-        steps = np.stack([around[0] - wall, wall - around[1]]) / raster.size[axis]
+        sides = [(int(k == axis), int(k == axis)) for k in range(2)]
+        around = np.pad(wall, sides, constant_values=np.nan)
+        if axis == 0 and raster.periodic:
+            around = np.pad(wall, sides, mode="wrap")
+        step = np.diff(around, axis=axis) / raster.size[axis]
+        steps = np.stack([np.delete(step, 0, axis), np.delete(step, -1, axis)])
         n = np.isfinite(steps).sum(axis=0)
         own = np.where(n > 0, np.nansum(steps, axis=0) / np.maximum(n, 1), np.nan)
         usual = np.sqrt(np.nanmean(own**2)) if np.isfinite(own).any() else 0.0
         found[..., axis] = np.where(np.isfinite(own), own, usual)
     return found.reshape(-1, 2)
-
-
-def _unknown(wall: FloatArray, axis: int, at: int) -> None:
-    if axis == 0:
-        wall[at] = np.nan
-    else:
-        wall[:, at] = np.nan
 
 
 def cell_changes(wall: WallHistory) -> list[CellChange]:
@@ -282,12 +249,9 @@ def date_means(wall: WallHistory) -> list[Growth | None]:
     common = common_cells(wall)
     if not common.any():
         return [None] * len(wall.dates)
-    found: list[Growth | None] = []
-    for v in range(len(wall.dates)):
-        factors = np.zeros(wall.solidity.shape)
-        factors[common, v] = 1.0 / np.count_nonzero(common)
-        found.append(wall.estimate(factors))
-    return found
+    share = common[:, None] / np.count_nonzero(common)
+    of_dates = np.eye(len(wall.dates))
+    return [wall.estimate(share * of_date) for of_date in of_dates]
 
 
 def _wall_factors(wall: WallHistory) -> FloatArray:

@@ -5,7 +5,8 @@ The map shows growth by colour and holes by what became of them.
 
 import math
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from matplotlib.patches import Patch, Rectangle
 from aqualvs import __version__
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.net_survey.comparison import Comparison, HoleState, OnWall, Site
+from aqualvs.net_survey.frames import SurveyShift, WallFrame
 from aqualvs.net_survey.growth import Growth
 from aqualvs.net_survey.tables import (
     STATE_TITLES,
@@ -46,14 +48,15 @@ _COLOURS = "BrBG_r"
 _MIN_SCALE = 1.0
 _GREY, _SEA = "#d5dade", "#ffffff"
 _LABELLED = 24
+_EDGE: dict[str, Any] = {"linestyle": "", "markeredgecolor": DARK, "markeredgewidth": 0.9}
 _MARKS: dict[HoleState, dict[str, Any]] = {
-    HoleState.NEW: {"marker": "o", "markerfacecolor": "#d7191c", "markersize": 10},
-    HoleState.GROWN: {"marker": "^", "markerfacecolor": "#f28e2b", "markersize": 10},
-    HoleState.SMALLER: {"marker": "v", "markerfacecolor": "#9ecae1", "markersize": 9},
-    HoleState.SAME: {"marker": "o", "markerfacecolor": "#4a5560", "markersize": 7},
-    HoleState.GONE: {"marker": "X", "markerfacecolor": "#ffffff", "markersize": 10},
-    HoleState.FIRST_LOOK: {"marker": "D", "markerfacecolor": "#f7c6c7", "markersize": 8},
-    HoleState.NOT_PASSED: {"marker": "s", "markerfacecolor": "#c9ced3", "markersize": 8},
+    HoleState.NEW: {**_EDGE, "marker": "o", "markerfacecolor": "#d7191c", "markersize": 10},
+    HoleState.GROWN: {**_EDGE, "marker": "^", "markerfacecolor": "#f28e2b", "markersize": 10},
+    HoleState.SMALLER: {**_EDGE, "marker": "v", "markerfacecolor": "#9ecae1", "markersize": 9},
+    HoleState.SAME: {**_EDGE, "marker": "o", "markerfacecolor": "#4a5560", "markersize": 7},
+    HoleState.GONE: {**_EDGE, "marker": "X", "markerfacecolor": "#ffffff", "markersize": 10},
+    HoleState.FIRST_LOOK: {**_EDGE, "marker": "D", "markerfacecolor": "#f7c6c7", "markersize": 8},
+    HoleState.NOT_PASSED: {**_EDGE, "marker": "s", "markerfacecolor": "#c9ced3", "markersize": 8},
 }
 _STYLE: dict[Any, Any] = {**STYLE, "axes.grid": False, "hatch.linewidth": 0.5}
 
@@ -93,7 +96,7 @@ def _map(wall: OnWall) -> Figure:
         _axis(one, wall, columns, last=row == n_rows - 1)
     bar = figure.colorbar(shades, ax=list(axes), shrink=min(1.0, 2.6 / size[1] + 0.3), pad=0.015)
     bar.set_label("change of solidity,\n% of the net's area a week")
-    figure.suptitle(_title(wall), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    _put_title(figure, _title(wall))
     _legend(figure, wall)
     return figure
 
@@ -104,8 +107,7 @@ def _columns(wall: OnWall) -> IntArray:
     Round a net the widest gap that nothing was seen in is cut out.
     """
     n = wall.history.raster.shape[0]
-    known = np.asarray(wall.history.known.any(axis=1))
-    seen = np.flatnonzero(known.reshape(n, -1).any(axis=1))
+    seen = np.flatnonzero(wall.history.known.reshape(n, -1).any(axis=1))
     if not len(seen) or not wall.frame.round:
         return np.arange(n)
     gaps = np.diff(np.append(seen, seen[0] + n))
@@ -122,25 +124,22 @@ def _shades(wall: OnWall) -> ScalarMappable:
 
 def _cells(axes: Axes, wall: OnWall, columns: IntArray, shades: ScalarMappable) -> None:
     raster, changes = wall.history.raster, {one.cell: one for one in wall.cells}
-    known = np.asarray(wall.history.known.any(axis=1))
+    known = np.asarray(wall.history.known.any(axis=1)).reshape(raster.shape)[columns]
     axes.set_facecolor(_SEA)
     width, height = map(float, raster.size)
-    for x, column in enumerate(columns):
-        for row in range(raster.shape[1]):
-            cell = int(column) * raster.shape[1] + row
-            if not known[cell]:
-                continue
-            corner = (x * width, float(raster.low[1]) + row * height)
-            one = changes.get(cell)
-            if one is None:
-                style: dict[str, Any] = {"facecolor": _GREY, "hatch": "////", "edgecolor": "white"}
-            else:
-                rate = np.array([100.0 * _WEEK * one.per_day.value])
-                style = {"facecolor": shades.to_rgba(rate)[0], "edgecolor": "white"}
-            axes.add_patch(Rectangle(corner, width, height, linewidth=0.4, **style))
-            if one is not None and one.changed:
-                middle = (corner[0] + 0.5 * width, corner[1] + 0.5 * height)
-                axes.plot(*middle, ".", color=DARK, markersize=2.2)
+    for x, row in np.argwhere(known).tolist():
+        cell = int(columns[x]) * raster.shape[1] + row
+        corner = (x * width, float(raster.low[1]) + row * height)
+        one = changes.get(cell)
+        if one is None:
+            style: dict[str, Any] = {"facecolor": _GREY, "hatch": "////", "edgecolor": "white"}
+        else:
+            rate = np.array([100.0 * _WEEK * one.per_day.value])
+            style = {"facecolor": shades.to_rgba(rate)[0], "edgecolor": "white"}
+        axes.add_patch(Rectangle(corner, width, height, linewidth=0.4, **style))
+        if one is not None and one.changed:
+            middle = (corner[0] + 0.5 * width, corner[1] + 0.5 * height)
+            axes.plot(*middle, ".", color=DARK, markersize=2.2)
 
 
 def _sites(axes: Axes, wall: OnWall, columns: IntArray) -> None:
@@ -150,14 +149,7 @@ def _sites(axes: Axes, wall: OnWall, columns: IntArray) -> None:
         x = _drawn(site.place, wall, columns)
         if not low <= x <= high:
             continue
-        axes.plot(
-            x,
-            site.place[1],
-            linestyle="",
-            markeredgecolor=DARK,
-            markeredgewidth=0.9,
-            **_MARKS[site.state],
-        )
+        axes.plot(x, site.place[1], **_MARKS[site.state])
         if many and site.state not in (HoleState.NEW, HoleState.GROWN):
             continue
         size = 1e3 * site.sizes[np.isfinite(site.sizes)][-1]
@@ -214,9 +206,7 @@ def _title(wall: OnWall) -> str:
 def _legend(figure: Figure, wall: OnWall) -> None:
     states = {one.state for one in wall.sites}
     shown: dict[str, Line2D | Patch] = {
-        "new hole" if state is HoleState.NEW else state.value: Line2D(
-            [], [], linestyle="", markeredgecolor=DARK, markeredgewidth=0.9, **style
-        )
+        "new hole" if state is HoleState.NEW else state.value: Line2D([], [], **style)
         for state, style in _MARKS.items()
         if state in states
     }
@@ -229,11 +219,7 @@ def _legend(figure: Figure, wall: OnWall) -> None:
         shown["seen on one date only"] = Patch(facecolor=_GREY, edgecolor="white", hatch="////")
     if shown:
         figure.legend(
-            list(shown.values()),
-            list(shown),
-            loc="outside lower left",
-            ncols=min(len(shown), 6),
-            frameon=False,
+            list(shown.values()), list(shown), loc="outside lower left", ncols=min(len(shown), 6)
         )
 
 
@@ -242,26 +228,18 @@ def _dates(result: Comparison) -> Figure:
     axes = figure.subplots()
     known = [(d, one) for d, one in zip(result.dates, result.whole, strict=True) if one]
     days = [day.toordinal() for day, _ in known]
-    axes.errorbar(
-        days,
-        [100.0 * one.value for _, one in known],
-        [100.0 * one.sigma for _, one in known],
-        fmt="o-",
-        color=DARK,
-        capsize=4.0,
-    )
+    values, sigmas = 100.0 * np.array([(one.value, one.sigma) for _, one in known]).T
+    axes.errorbar(days, values, sigmas, fmt="o-", color=DARK, capsize=4.0)
     axes.set_xticks(days, [day.isoformat() for day, _ in known])
     axes.margins(x=0.12)
     axes.set_ylabel("solidity of all that was seen, %")
     axes.grid(color=PALE, linewidth=0.6)
-    figure.suptitle(
-        "Whole dives: places on the net are not compared",
-        x=0.01,
-        ha="left",
-        fontsize=12,
-        fontweight="bold",
-    )
+    _put_title(figure, "Whole dives: places on the net are not compared")
     return figure
+
+
+def _put_title(figure: Figure, words: str) -> None:
+    figure.suptitle(words, x=0.01, ha="left", fontsize=12, fontweight="bold")
 
 
 _NONE = "–"
@@ -301,13 +279,11 @@ def _cards(result: Comparison) -> list[Card]:
         found.append(Card("Fouling a week", value, f"± {sigma:.1f} %: {verdict(growth)}"))
     if wall is None:
         return found
-    counts = {state: len(some) for state, some in by_state(wall.sites).items()}
-    new, grown = counts.get(HoleState.NEW, 0), counts.get(HoleState.GROWN, 0)
-    first = counts.get(HoleState.FIRST_LOOK, 0)
-    found.append(Card("New holes", str(new), f"{grown} grown, {first} where none looked before"))
-    unseen = counts.get(HoleState.NOT_PASSED, 0)
-    gone = counts.get(HoleState.GONE, 0)
-    found.append(Card("Holes gone", str(gone), f"{unseen} more were not passed this time"))
+    n = Counter(one.state for one in wall.sites)
+    words = f"{n[HoleState.GROWN]} grown, {n[HoleState.FIRST_LOOK]} where none looked before"
+    found.append(Card("New holes", str(n[HoleState.NEW]), words))
+    words = f"{n[HoleState.NOT_PASSED]} more were not passed this time"
+    found.append(Card("Holes gone", str(n[HoleState.GONE]), words))
     return found
 
 
@@ -322,13 +298,8 @@ def _holes(result: Comparison) -> html.Raw:
         return html.Raw("<p>None was found on any date.</p>")
     rows = [_hole_row(one, wall) for some in by_state(wall.sites).values() for one in some]
     head = (
-        "what became of it",
-        "place",
-        "diameter",
-        "first seen",
-        "last seen",
-        "looked at before",
-        "looked at now",
+        *("what became of it", "place", "diameter"),
+        *("first seen", "last seen", "looked at before", "looked at now"),
     )
     return html.folded(html.table(head, rows, texts=2), len(rows), "holes", longest=30)
 
@@ -348,9 +319,8 @@ def _hole_row(one: Site, wall: OnWall) -> tuple[str, ...]:
 
 
 def _table_of_dates(result: Comparison) -> html.Raw:
-    wall = result.wall
     on_wall: dict[object, Growth | None] = {}
-    if wall is not None:
+    if (wall := result.wall) is not None:
         on_wall = dict(zip(wall.history.dates, wall.means, strict=True))
     rows = [
         (day.isoformat(), _share(on_wall.get(day)), _share(whole))
@@ -365,34 +335,29 @@ def _share(one: Growth | None) -> str:
 
 
 def _dives(result: Comparison, origins: Mapping[str, str]) -> html.Raw:
-    shifts = {}
-    if result.wall is not None:
-        wall = result.wall
+    shifts: dict[Path, Sequence[str]] = {}
+    if (wall := result.wall) is not None:
         for one, shift in zip(wall.placed, wall.shifts, strict=True):
-            shifts[one.survey.folder] = (shift, wall.frame)
-    rows = []
-    for survey in result.surveys:
-        found = shifts.get(survey.folder)
-        words = [_NONE, _NONE]
-        if found is not None and not found[0].sigma.any():
-            words = ["as logged", "as logged"]
-        elif found is not None:
-            shift, frame = found
-            scale, unit = (np.rad2deg(1.0 / frame.radius), "°") if frame.round else (1.0, " m")
-            ends = ((scale, unit), (1.0, " m"))
-            words = [
-                signed(f"{with_sign(k * value, 2)} ± {k * sigma:.2f}{u}")
-                for (k, u), value, sigma in zip(ends, shift.value, shift.sigma, strict=True)
-            ]
-        rows.append(
-            (
-                str(survey.folder),
-                survey.date.isoformat(),
-                origins.get(str(survey.folder), ""),
-                str(len(survey.stretches.along)),
-                str(len(survey.holes.number)),
-                *words,
-            )
+            shifts[one.survey.folder] = _shift_cells(shift, wall.frame)
+    rows = [
+        (
+            *(str(survey.folder), survey.date.isoformat(), origins.get(str(survey.folder), "")),
+            *(str(len(survey.stretches.along)), str(len(survey.holes.number))),
+            *shifts.get(survey.folder, (_NONE, _NONE)),
         )
+        for survey in result.surveys
+    ]
     head = ("dive", "date", "date from", "stretches", "holes", "shifted along", "shifted down")
     return html.table(head, rows, texts=3)
+
+
+def _shift_cells(shift: SurveyShift, frame: WallFrame) -> Sequence[str]:
+    if not shift.sigma.any():
+        return "as logged", "as logged"
+    scale, unit = (np.rad2deg(1.0 / frame.radius), "°") if frame.round else (1.0, " m")
+    return [
+        signed(f"{with_sign(k * value, 2)} ± {k * sigma:.2f}{u}")
+        for k, u, value, sigma in zip(
+            (scale, 1.0), (unit, " m"), shift.value, shift.sigma, strict=True
+        )
+    ]

@@ -50,8 +50,7 @@ def date_of_run(folder: Path) -> tuple[date, str]:
     source = _source(folder)
     names = [(folder.resolve().name, "the folder's name"), (source.name, "the video's name")]
     for name, words in names:
-        found = named_date(name)
-        if found is not None:
+        if (found := named_date(name)) is not None:
             return found, words
     start = dive_start_utc(source) if source.is_file() else None
     if start is not None:
@@ -187,13 +186,10 @@ def left_out(folder: Path) -> list[str]:
     missing = [run.name for run in runs if not (run / NET_CSV).is_file()]
     if not missing:
         return []
-    n = len(missing)
-    words = (
-        "dive whose net has not been evaluated is"
-        if n == 1
-        else "dives whose nets have not been evaluated are"
-    )
-    return [f"{folder}: {n} {words} left out: {', '.join(missing)} (aqualvs net)"]
+    words = "dives whose nets have not been evaluated are"
+    if len(missing) == 1:
+        words = "dive whose net has not been evaluated is"
+    return [f"{folder}: {len(missing)} {words} left out: {', '.join(missing)} (aqualvs net)"]
 
 
 def read_survey(folder: Path, day: date) -> Survey:
@@ -207,8 +203,7 @@ def read_survey(folder: Path, day: date) -> Survey:
     facts = content["aqualvs_net"]
     try:
         outline = _outlines(content["features"], len(rows))
-        stretches = _stretches(rows, outline)
-        found = _holes(holes)
+        stretches, found = _stretches(rows, outline), _holes(holes)
         n_holes = facts.get("summary", {}).get("n_holes", len(holes))
         if n_holes != len(holes):
             raise ValueError(f"{HOLES_CSV} holds {len(holes)} of {n_holes} holes")
@@ -275,16 +270,17 @@ def _holes(rows: Sequence[Row]) -> Holes:
 
 def _lasers_share(facts: Mapping[str, Any], outline: FloatArray) -> float:
     """Return how much of the height of the picture's bands lasers looked at."""
-    looked, passed = facts.get("summary", {}).get("area_m2"), float(np.abs(_areas(outline)).sum())
+    looked, passed = facts.get("summary", {}).get("area_m2"), float(areas(outline).sum())
     if not isinstance(looked, int | float) or not passed > 0.0:
         return _LASERS_SHARE
     return float(np.clip(looked / passed, 0.1, 1.0))
 
 
-def _areas(outline: FloatArray) -> FloatArray:
+def areas(outline: FloatArray) -> FloatArray:
+    """Return the areas (K,) in outlines (K, 4, 2)."""
     x, y = outline[..., 0], outline[..., 1]
     turned = x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1)
-    return np.asarray(0.5 * turned.sum(axis=-1))
+    return np.asarray(0.5 * np.abs(turned.sum(axis=-1)), np.float64)
 
 
 def _outlines(features: Sequence[Mapping[str, Any]], n: int) -> FloatArray:

@@ -1,13 +1,14 @@
 """Tables and sentences of a comparison: `net_change.csv`, `holes_change.csv`, and the summary."""
 
 from collections.abc import Iterator, Sequence
+from datetime import date
 
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.net_survey.comparison import LOOKED, Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.frames import WallFrame
-from aqualvs.net_survey.growth import CellChange, Growth
+from aqualvs.net_survey.growth import CellChange, Growth, common_cells
 from aqualvs.nets.tables import Cell
 from aqualvs.text import count_text, with_sign
 
@@ -114,11 +115,7 @@ def _shift_lines(wall: OnWall) -> Iterator[str]:
             parts.append(f"along {with_sign(shift.value[0], 2)} ± {shift.sigma[0]:.2f} m")
         if shift.determined[1]:
             parts.append(f"depth {with_sign(shift.value[1], 2)} ± {shift.sigma[1]:.2f} m")
-        how = " and ".join(
-            name
-            for name, found in (("growth", shift.by_pattern), ("holes", shift.by_holes))
-            if found
-        )
+        how = " and ".join(["growth"] * shift.by_pattern + ["holes"] * shift.by_holes)
         yield f"{one.survey.name}: aligned with earlier dives by {how}: {', '.join(parts)}"
 
 
@@ -166,7 +163,7 @@ def _mean_lines(wall: OnWall) -> Iterator[str]:
     if not known:
         yield "  no part of the net was seen on all dates"
         return
-    n = int(np.count_nonzero(wall.history.known.all(axis=1)))
+    n = int(np.count_nonzero(common_cells(wall.history)))
     area = n * float(np.prod(wall.history.raster.size))
     means = ", ".join(f"{day}: {100 * m.value:.1f} ± {100 * m.sigma:.1f} %" for day, m in known)
     yield f"  solidity of the {area:.0f} m² seen on all dates: {means}"
@@ -222,10 +219,9 @@ def _not_looked(wall: OnWall) -> Iterator[str]:
         )
 
 
-_DATES = ("first_date", "last_date", "n_dates")
 NET_CHANGE_COLUMNS = (
     *("cell", "depth_from_m", "depth_to_m", "bearing_from_deg", "bearing_to_deg"),
-    *("along_from_m", "along_to_m", *_DATES),
+    *("along_from_m", "along_to_m", "first_date", "last_date", "n_dates"),
     *("solidity_before", "sigma_before", "solidity_after", "sigma_after"),
     *("difference", "sigma_difference", "z", "per_day", "sigma_per_day", "change"),
     *("excess_per_day", "sigma_excess", "beside"),
@@ -247,30 +243,23 @@ _PLACES, _SHARES, _RATES = 3, 4, 6
 
 def cell_rows(result: Comparison) -> list[dict[str, Cell]]:
     """Return the rows of `net_change.csv`."""
-    if result.wall is None:
+    if (wall := result.wall) is None:
         return _whole_rows(result)
-    wall = result.wall
     return [_cell_row(one, wall) for one in wall.cells]
 
 
 def hole_rows(result: Comparison) -> list[dict[str, Cell]]:
     """Return the rows of `holes_change.csv`."""
-    if result.wall is not None:
-        wall = result.wall
+    if (wall := result.wall) is not None:
         return [_site_row(i, one, wall) for i, one in enumerate(wall.sites)]
     rows: list[dict[str, Cell]] = []
     for survey in result.surveys:
-        for number, diameter, sigma in zip(
-            survey.holes.number, survey.holes.diameter, survey.holes.sigma, strict=True
-        ):
-            row = dict.fromkeys(HOLES_CHANGE_COLUMNS, None) | {
-                "site": len(rows) + 1,
-                "state": NOT_COMPARED,
-                "first_seen": survey.date.isoformat(),
-                "last_seen": survey.date.isoformat(),
-                "holes": f"{survey.name}:{number}",
-            }
-            when = "before" if survey.date < result.dates[-1] else "after"
+        day, holes = survey.date.isoformat(), survey.holes
+        when = "before" if survey.date < result.dates[-1] else "after"
+        for number, diameter, sigma in zip(holes.number, holes.diameter, holes.sigma, strict=True):
+            row = dict.fromkeys(HOLES_CHANGE_COLUMNS, None)
+            row |= {"site": len(rows) + 1, "state": NOT_COMPARED}
+            row |= {"first_seen": day, "last_seen": day, "holes": f"{survey.name}:{number}"}
             row |= {f"diameter_{when}_mm": _mm(diameter), f"sigma_{when}_mm": _mm(sigma)}
             rows.append(row)
     return rows
@@ -282,17 +271,13 @@ def _whole_rows(result: Comparison) -> list[dict[str, Cell]]:
         return []
     (first, before), (last, after) = known[0], known[-1]
     change = Growth(after.value - before.value, float(np.hypot(before.sigma, after.sigma)))
-    seen = [
-        sum(
-            float(s.stretches.seen[s.stretches.usable].sum()) for s in result.surveys if s.date == d
-        )
-        for d in (first, last)
-    ]
+    seen = dict.fromkeys(result.dates, 0.0)
+    for survey in result.surveys:
+        seen[survey.date] += float(survey.stretches.seen[survey.stretches.usable].sum())
     row = dict.fromkeys(NET_CHANGE_COLUMNS, None)
-    row |= {"cell": "all", "first_date": first.isoformat(), "last_date": last.isoformat()}
-    row |= {"n_dates": len(known), **_numbers(before, after, change, result.rate)}
-    row |= {"change": _change(change, abs(change.z) > 2.0)}
-    return [row | {"seen_before_m": round(seen[0], 1), "seen_after_m": round(seen[1], 1)}]
+    row |= {"cell": "all", **_dates(first, last, len(known), (seen[first], seen[last]))}
+    row |= _numbers(before, after, change, result.rate)
+    return [row | {"change": _change(change, abs(change.z) > 2.0)}]
 
 
 def _cell_row(one: CellChange, wall: OnWall) -> dict[str, Cell]:
@@ -306,12 +291,17 @@ def _cell_row(one: CellChange, wall: OnWall) -> dict[str, Cell]:
         row |= _between("bearing", "deg", *ends)
     else:
         row |= _between("along", "m", float(low[0]), float(high[0]))
-    row |= {"first_date": dates[one.first].isoformat(), "last_date": dates[one.last].isoformat()}
-    row |= {"n_dates": one.n_dates, **_numbers(one.before, one.after, one.difference, one.per_day)}
+    row |= _dates(dates[one.first], dates[one.last], one.n_dates, one.seen)
+    row |= _numbers(one.before, one.after, one.difference, one.per_day)
     row |= {"change": _change(one.difference, one.changed)}
     row |= {"excess_per_day": round(one.excess.value, _RATES)}
-    row |= {"sigma_excess": round(one.excess.sigma, _RATES), "beside": _beside(one)}
-    return row | {"seen_before_m": round(one.seen[0], 1), "seen_after_m": round(one.seen[1], 1)}
+    return row | {"sigma_excess": round(one.excess.sigma, _RATES), "beside": _beside(one)}
+
+
+def _dates(first: date, last: date, n_dates: int, seen: tuple[float, float]) -> dict[str, Cell]:
+    found: dict[str, Cell] = {"seen_before_m": round(seen[0], 1), "seen_after_m": round(seen[1], 1)}
+    found |= {"first_date": first.isoformat(), "last_date": last.isoformat(), "n_dates": n_dates}
+    return found
 
 
 def _between(name: str, unit: str, low: float, high: float) -> dict[str, Cell]:
@@ -319,17 +309,15 @@ def _between(name: str, unit: str, low: float, high: float) -> dict[str, Cell]:
 
 
 def _numbers(before: Growth, after: Growth, change: Growth, rate: Growth) -> dict[str, Cell]:
-    return {
-        "solidity_before": round(before.value, _SHARES),
-        "sigma_before": round(before.sigma, _SHARES),
-        "solidity_after": round(after.value, _SHARES),
-        "sigma_after": round(after.sigma, _SHARES),
-        "difference": round(change.value, _SHARES),
-        "sigma_difference": round(change.sigma, _SHARES),
-        "z": round(change.z, 2),
-        "per_day": round(rate.value, _RATES),
-        "sigma_per_day": round(rate.sigma, _RATES),
-    }
+    found: dict[str, Cell] = {"z": round(change.z, 2)}
+    for value, sigma, growth, digits in (
+        ("solidity_before", "sigma_before", before, _SHARES),
+        ("solidity_after", "sigma_after", after, _SHARES),
+        ("difference", "sigma_difference", change, _SHARES),
+        ("per_day", "sigma_per_day", rate, _RATES),
+    ):
+        found |= {value: round(growth.value, digits), sigma: round(growth.sigma, digits)}
+    return found
 
 
 def _change(difference: Growth, beyond: bool) -> str:
@@ -352,8 +340,7 @@ def _site_row(i: int, one: Site, wall: OnWall) -> dict[str, Cell]:
     row |= {"site": i + 1, "state": one.state.value, **_place(one.place, one.sigma, wall.frame)}
     if len(before):
         k = before[-1]
-        row |= {"diameter_before_mm": _mm(one.sizes[k])}
-        row |= {"sigma_before_mm": _mm(one.sigma_sizes[k])}
+        row |= {"diameter_before_mm": _mm(one.sizes[k]), "sigma_before_mm": _mm(one.sigma_sizes[k])}
     if seen[-1] == len(dates) - 1:
         row |= {"diameter_after_mm": _mm(one.sizes[-1]), "sigma_after_mm": _mm(one.sigma_sizes[-1])}
     row |= {
@@ -369,20 +356,14 @@ def _site_row(i: int, one: Site, wall: OnWall) -> dict[str, Cell]:
 
 
 def _place(place: FloatArray, sigma: FloatArray, frame: WallFrame) -> dict[str, Cell]:
-    found: dict[str, Cell] = {
-        "depth_m": round(float(place[1]), _PLACES),
-        "sigma_depth_m": round(float(sigma[1]), _PLACES),
-    }
+    (u, depth), (sigma_u, sigma_depth) = (
+        [round(float(value), _PLACES) for value in one] for one in (place, sigma)
+    )
+    found: dict[str, Cell] = {"depth_m": depth, "sigma_depth_m": sigma_depth}
     if not frame.round:
-        return found | {
-            "along_m": round(float(place[0]), _PLACES),
-            "sigma_along_m": round(float(sigma[0]), _PLACES),
-        }
-    degrees = float(np.rad2deg(sigma[0] / frame.radius))
-    return found | {
-        "bearing_deg": round(bearing_deg(float(place[0]), frame), 1),
-        "sigma_bearing_deg": round(degrees, 1),
-    }
+        return found | {"along_m": u, "sigma_along_m": sigma_u}
+    bearing, degrees = bearing_deg(float(place[0]), frame), np.rad2deg(sigma[0] / frame.radius)
+    return found | {"bearing_deg": round(bearing, 1), "sigma_bearing_deg": round(float(degrees), 1)}
 
 
 def _mm(metres: float) -> float:

@@ -93,22 +93,12 @@ class _Observations:
 
 
 class NetCondition:
-    """Accumulator of the condition of a net over a dive.
-
-    Parameters
-    ----------
-    rig : Rig
-        Rig of the scans.
-
-    Attributes
-    ----------
-    stretches : list of NetStretch
-        Completed stretches. Where the net's lattice is found only later, the places of earlier
-        stretches and the holes in them are filled in then.
-    """
+    """Accumulator of the condition of a net over a dive, from scans with a rig."""
 
     def __init__(self, rig: Rig, options: NetConditionOptions | None = None) -> None:
         self.options = options or NetConditionOptions()
+        # Completed stretches. Where the net's lattice is found only later, the places of earlier
+        # stretches and the holes in them are filled in then.
         self.stretches: list[NetStretch] = []
         self._reader = NetReader(rig)
         self._signals: list[NetSignal] = []
@@ -132,14 +122,10 @@ class NetCondition:
         return self._map.area
 
     def add(self, scan: Scan, velocity: FloatArray | None = None) -> NetStretch | None:
-        """Add a scan; return the stretch that it completes, if any.
+        """Add a scan, in the order of time; return the stretch that it completes, if any.
 
-        Parameters
-        ----------
-        scan : Scan
-            In the order of time. Frames without a posture, or without a net, are skipped.
-        velocity : array, shape (2,), optional
-            Of the vehicle along the net, right and up in m/s, if another sensor measures it.
+        Frames without a posture, or without a net, are skipped. `velocity`, shape (2,): of the
+        vehicle along the net, right and up in m/s, if another sensor measures it.
         """
         finished = None
         if self._signals and scan.time_s - self._signals[0].time_s >= self._duration_s():
@@ -193,11 +179,9 @@ class NetCondition:
         for i, seen in self._waiting.items():
             begin = self._track.place
             self._register(lattice, seen)
+            place, piece = self._track.place, self._track.piece
             self.stretches[i] = replace(
-                self.stretches[i],
-                begin_place=begin,
-                place=self._track.place,
-                piece=self._track.piece,
+                self.stretches[i], begin_place=begin, place=place, piece=piece
             )
         self._waiting.clear()
 
@@ -274,9 +258,7 @@ class NetCondition:
             if not known.any():
                 continue
             share = lit[i] / np.maximum(observed[i], 1.0)
-            bright = known & (share > dim * np.median(share[known]))
-            bright |= ~known
-            inside = np.flatnonzero(bright)
+            inside = np.flatnonzero(~known | (share > dim * np.median(share[known])))
             if len(inside):
                 usable[i, : edges[inside[0]]] = False
                 usable[i, edges[inside[-1]] + bin_lines :] = False

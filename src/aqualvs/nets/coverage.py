@@ -135,12 +135,8 @@ class Twine:
 def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twine | None:
     """Fit twine and sheet to the dashes of several kinds; None without any.
 
-    Parameters
-    ----------
-    kinds : sequence of DashKind
-        The more different their angles and slants, the better.
-    known : float, optional
-        Known diameter of the bare twine in metres: then the halo is measured.
+    The more different the angles and slants of the kinds, the better. Where the diameter of the
+    bare twine is `known`, in metres, the halo is measured.
     """
     if not kinds:
         return None
@@ -155,12 +151,9 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
         return Twine(known, 0.0, body, float(sheet), halo, _TWINE.seen * sigma_strand)
     step, height = np.median([[k.step, k.height] for k in kinds], axis=0)
     faint = max(1.0 - float(height) / _TWINE.faint, 0.0)
-    of_halo = (
-        math.hypot(_TWINE.sigma_halo * float(step), _TWINE.sigma_faint * faint * float(strand))
-        / _TWINE.seen
-    )
-    sigma = math.hypot(sigma_strand, of_halo)
     body = float(strand)
+    of_halo = math.hypot(_TWINE.sigma_halo * float(step), _TWINE.sigma_faint * faint * body)
+    sigma = math.hypot(sigma_strand, of_halo / _TWINE.seen)
     return Twine(
         thickness=body / silhouette,
         sigma=sigma / silhouette,
@@ -233,50 +226,6 @@ def _model(
     return expected, slope.reshape(-1, 3)
 
 
-class _KindOptions(NamedTuple):
-    """Choice of the dashes that are compared."""
-
-    # Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
-    min_across: float = 0.4
-    on_strand: float = 0.12
-    clear: float = 0.2
-    min_dashes: int = 6
-    # Growth lengthens dashes and makes them differ. Share of all light on a kind's dashes up to
-    # which they are bare, and the scale of the spread with which it falls; then the spread by
-    # noise, in grey levels, and without noise. From simulated dives.
-    bare_share: float = 0.45
-    differ: float = 0.22
-    min_bare: float = 0.08
-    noise: float = 7.0
-    no_noise: float = 0.03
-    short: float = 0.25
-    long: float = 0.7
-    slanted: float = 1.5
-    usual_spread: float = 0.15
-    width_quantile: float = 0.4
-    # Dashes of more search lines may be lost (`segments`).
-    max_lines: float = 20.0
-    blocks: int = 6
-
-
-_KIND = _KindOptions()
-
-
-class _SolidityErrors(NamedTuple):
-    """Errors of solidity, as shares."""
-
-    # Errors of solidity for dashes that run together or are not seen, as shares: of any net, and
-    # per pixel in the distance of two strands (simulated dives).
-    share: float = 0.04
-    unresolved: float = 1.5
-    # And as a share of the area that growth adds: it stands out of the net, and is lit and seen
-    # askew.
-    growth: float = 0.25
-
-
-_ERRORS = _SolidityErrors()
-
-
 @dataclass(frozen=True, slots=True)
 class RegisteredView:
     """A frame with the place of the lattice in it."""
@@ -316,33 +265,36 @@ def _angles(lattice: NetLattice, one: RegisteredView) -> _Angles:
 def dash_kinds(lattice: NetLattice, frames: Sequence[RegisteredView]) -> list[DashKind]:
     """Group whole dashes that lie clearly on one strand by laser and family."""
     rows = [_rows(lattice, one) for one in frames]
-    table = np.concatenate(rows) if rows else np.empty((0, 9))
+    table = np.concatenate([np.empty((0, 9)), *rows])
     kinds = np.unique(table[:, :2], axis=0)
     each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
-    each = [mine for mine in each if len(mine) >= _KIND.min_dashes]
+    min_dashes, slanted, usual_spread, short, long = 6, 1.5, 0.15, 0.25, 0.7
+    each = [mine for mine in each if len(mine) >= min_dashes]
     # Long dashes against short ones; on slanted strands the light sheet evens them out.
-    spreads = [
-        np.log(_length_at(mine, _KIND.long) / _length_at(mine, _KIND.short))
-        for mine in each
-        if np.median(mine[:, 3]) < _KIND.slanted
-    ]
-    spread = float(np.median(spreads)) if spreads else _KIND.usual_spread
+    even = [mine for mine in each if np.median(mine[:, 3]) < slanted]
+    spreads = [np.log(_length_at(mine, long) / _length_at(mine, short)) for mine in even]
+    spread = float(np.median(spreads)) if spreads else usual_spread
     return [_kind(mine, spread) for mine in each]
 
 
 def _kind(mine: FloatArray, spread: float) -> DashKind:
     """Average dashes, given as rows of `_rows`."""
     across, slant, height, step, pixel = np.median(mine[:, [2, 3, 6, 7, 8]], axis=0)
-    noise = np.hypot(_KIND.noise / max(height, 1.0), _KIND.no_noise)
+    # Growth lengthens dashes and makes them differ. Share of all light on a kind's dashes up to
+    # which they are bare, and the scale of the spread with which it falls; then the spread by
+    # noise, in grey levels, and without noise. From simulated dives.
+    bare_share, differ, min_bare, noise, no_noise = 0.45, 0.22, 0.08, 7.0, 0.03
+    noise = np.hypot(noise / max(height, 1.0), no_noise)
     grown = np.sqrt(max(spread**2 - noise**2, 0.0))
-    share = float(max(_KIND.bare_share * np.exp(-grown / _KIND.differ), _KIND.min_bare))
+    share = float(max(bare_share * np.exp(-grown / differ), min_bare))
+    width_quantile = 0.4
     return DashKind(
         laser=int(mine[0, 0]),
         family=int(mine[0, 1]),
         across=float(across),
         slant=float(slant),
         length=_length_at(mine, share),
-        width=float(np.quantile(mine[:, 5], _KIND.width_quantile)),
+        width=float(np.quantile(mine[:, 5], width_quantile)),
         height=float(height),
         step=float(step),
         pixel=float(pixel),
@@ -362,10 +314,12 @@ def _rows(lattice: NetLattice, one: RegisteredView) -> FloatArray:
     """Return rows (laser, family, across, slant, length, width, height, step) of clear dashes."""
     pitch, dashes, fit = lattice.pitch, one.view.dashes, one.fit
     angles = _angles(lattice, one)
-    clear = dashes.whole & (fit.off < _KIND.on_strand * pitch[fit.family])
-    clear &= angles.across > _KIND.min_across
+    # Crossing angle (sine), distance from the strand and from others (pitches).
+    min_across, on_strand, clear_of_others = 0.4, 0.12, 0.2
+    clear = dashes.whole & (fit.off < on_strand * pitch[fit.family])
+    clear &= angles.across > min_across
     if lattice.mesh is Mesh.FOUR_SIDED:
-        clear &= fit.clear > _KIND.clear * pitch.min()
+        clear &= fit.clear > clear_of_others * pitch.min()
     step = one.view.step[dashes.laser]
     # A search line is a whole number of pixels wide; its step gives their size on the net more
     # accurately than the range does.
@@ -416,15 +370,19 @@ def measure_solidity(
     if not np.all(np.any(counts & (seen.sum(axis=0) > 0.0)[:, None], axis=0)):
         return None
     solidity = _family_sum(body, seen, counts)
-    blocks = np.array_split(np.arange(len(frames)), min(_KIND.blocks, len(frames)))
+    n_blocks = min(6, len(frames))
+    blocks = np.array_split(np.arange(len(frames)), n_blocks)
     parts = [_family_sum(body[b], seen[b], counts) for b in blocks]
     chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
-    unresolved = (
-        _ERRORS.unresolved * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
-    )
-    shares = [_spread_of_mean(np.concatenate(rows)), _ERRORS.share, unresolved]
-    bare = float(np.sum(twine.body * lattice.density / lattice.pitch))
-    grown = _ERRORS.growth * max(solidity - bare, 0.0)
+    # Errors for dashes that run together or are not seen, as shares: of any net, and per pixel in
+    # the distance of two strands (simulated dives); and as a share of the area that growth adds: it
+    # stands out of the net, and is lit and seen askew.
+    of_any, per_pixel, of_growth = 0.04, 1.5, 0.25
+    pixel = frames[len(frames) // 2].view.pixel
+    unresolved = per_pixel * pixel / float(lattice.pitch.min())
+    shares = [_spread_of_mean(np.concatenate(rows)), of_any, unresolved]
+    bare = float(np.sum(twine.body * lattice.mesh.density / lattice.pitch))
+    grown = of_growth * max(solidity - bare, 0.0)
     sigmas = [chance, _family_sum(error, seen, counts), grown, *(solidity * one for one in shares)]
     return float(np.clip(solidity, 0.0, 1.0)), float(np.linalg.norm(sigmas))
 
@@ -490,7 +448,8 @@ def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
     angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])
     step = view.step[:, None]
     lines = twine.dash_length(angles.across, angles.slant, step, USUAL_HEIGHT) / step
-    good: BoolArray = lines < _KIND.max_lines
+    max_lines = 20.0  # Longer dashes may be lost (`segments`).
+    good: BoolArray = lines < max_lines
     best = lines.argmin(axis=0)
     good[best, np.arange(len(best))] = True
     return good

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, kernel
-from aqualvs.nets.lit_intervals import LineState, NetSignal
+from aqualvs.nets.lit_intervals import LineState, NetFrame, NetSignal
 from aqualvs.nets.spectrum import Crossings
 
 
@@ -36,11 +36,10 @@ _DASH = _DashOptions()
 
 
 class _LaserLines(NamedTuple):
-    """The lasers' lines on a net in one frame, L of them, over J search lines."""
+    """The lasers' lines on a net in one frame, L of them, as in `NetSignal`; `along` ascends."""
 
-    # Shape (L, J): `LineState` values.
+    # Shape (L, J).
     state: NDArray[np.uint8]
-    # Shape (L, J): as in `NetSignal`.
     along: FloatArray
     step: FloatArray
     height: FloatArray
@@ -49,15 +48,13 @@ class _LaserLines(NamedTuple):
 
 
 @kernel
-def cut_lines(
+def _cut_lines(
     lines: _LaserLines, dash: FloatArray, gap: FloatArray, span: FloatArray, usual: FloatArray
 ) -> tuple[int, int, int]:
     """Cut the lines into dashes, gaps and spans; return their numbers.
 
     Parameters
     ----------
-    lines : _LaserLines
-        L of them.
     dash : array, shape (N, 6)
         Rows laser, whole, middle, length, height, width as in `Dashes`; written.
     gap : array, shape (K, 6)
@@ -73,23 +70,20 @@ def cut_lines(
         steps = lines.step[i][lines.step[i] > 0.0]
         usual[i, 0] = np.median(steps) if len(steps) else 0.0
         n_dark, n_beyond = 0, 0
-        # Gaps and dashes ascend along the line, regardless of the order of the search lines.
-        back = _descends(lines.along[i])
         begin = 0
         while begin < n_lines:
             end = begin
-            while end < n_lines and state[i, _turned(end, n_lines, back)] != 0:
-                j = _turned(end, n_lines, back)
-                dark = state[i, j] == 1
+            while end < n_lines and state[i, end] != 0:
+                dark = state[i, end] == 1
                 n_dark += dark
-                n_beyond += dark and lines.beyond[i, j]
+                n_beyond += dark and lines.beyond[i, end]
                 end += 1
             if end == begin:
                 begin += 1
                 continue
             span[m, 0] = i
-            span[m, 1], span[m, 2] = _ends(lines, i, begin, end - 1, back)
-            n, k = _cut_span(lines, i, begin, end, back, dash, n, gap, k)
+            span[m, 1], span[m, 2] = _ends(lines, i, begin, end - 1)
+            n, k = _cut_span(lines, i, begin, end, dash, n, gap, k)
             m += 1
             begin = end
         usual[i, 1] = n_beyond / max(n_dark, 1)
@@ -102,28 +96,26 @@ def _cut_span(
     i: int,
     begin: int,
     end: int,
-    back: bool,
     dash: FloatArray,
     n: int,
     gap: FloatArray,
     k: int,
 ) -> tuple[int, int]:
     """Append the dashes and gaps of one span; return the new counts."""
-    state, height, n_lines = lines.state, lines.height, lines.state.shape[1]
+    state, height = lines.state, lines.height
     brightest = height[i].max()
     j, dark_from = begin, begin
     while j < end:
-        if state[i, _turned(j, n_lines, back)] != 2:
+        if state[i, j] != 2:
             j += 1
             continue
         first, last = j, j
         bridged = _DASH.bridged
-        if height[i, _turned(first, n_lines, back)] < _DASH.unfaded * brightest:
+        if height[i, first] < _DASH.unfaded * brightest:
             bridged = _DASH.white
         while j < end and j - last <= bridged + 1:
-            b = _turned(j, n_lines, back)
-            if state[i, b] == 2:
-                ends = min(height[i, _turned(last, n_lines, back)], height[i, b])
+            if state[i, j] == 2:
+                ends = min(height[i, last], height[i, j])
                 if j - last > _DASH.bridged + 1 and ends < _DASH.unfaded * brightest:
                     break
                 last = j
@@ -131,50 +123,46 @@ def _cut_span(
         j = last + 1
         peak, wide, n_bright = 0.0, 0.0, 0
         for a in range(first, last + 1):
-            peak = max(peak, height[i, _turned(a, n_lines, back)])
+            peak = max(peak, height[i, a])
         for a in range(first, last + 1):
-            b = _turned(a, n_lines, back)
-            if height[i, b] >= _DASH.bright * peak:
-                wide += lines.width[i, b]
+            if height[i, a] >= _DASH.bright * peak:
+                wide += lines.width[i, a]
                 n_bright += 1
-        length = _length_above(lines, i, first, last, back, _DASH.level * peak)
-        low, high = _ends(lines, i, first, last, back)
+        length = _length_above(lines, i, first, last, _DASH.level * peak)
+        low, high = _ends(lines, i, first, last)
         dash[n, 0], dash[n, 1] = i, 1.0 if first > begin and last < end - 1 else 0.0
         dash[n, 2], dash[n, 3] = 0.5 * (low + high), length
         dash[n, 4], dash[n, 5] = peak, wide / n_bright
         if first > dark_from:
-            _put_gap(lines, i, dark_from, first - 1, back, gap, k, dark_from > begin, True)
+            _put_gap(lines, i, dark_from, first - 1, gap, k, dark_from > begin, True)
             k += 1
         dark_from = last + 1
         n += 1
     if end > dark_from:
-        _put_gap(lines, i, dark_from, end - 1, back, gap, k, dark_from > begin, False)
+        _put_gap(lines, i, dark_from, end - 1, gap, k, dark_from > begin, False)
         k += 1
     return n, k
 
 
 @inner_kernel
-def _length_above(
-    lines: _LaserLines, i: int, first: int, last: int, back: bool, level: float
-) -> float:
+def _length_above(lines: _LaserLines, i: int, first: int, last: int, level: float) -> float:
     """Return the metres of a run of search lines above a level, by linear interpolation.
 
     Outside the run it is dark; bridged lines are as bright as the one before.
     """
-    step, height, n_lines = lines.step, lines.height, lines.step.shape[1]
+    step, height = lines.step, lines.height
     length, before = 0.0, 0.0
     for a in range(first, last + 1):
-        b = _turned(a, n_lines, back)
-        here = height[i, b] if height[i, b] > 0.0 else before
-        after = height[i, _turned(a + 1, n_lines, back)] if a < last else 0.0
+        here = height[i, a] if height[i, a] > 0.0 else before
+        after = height[i, a + 1] if a < last else 0.0
         if after == 0.0 and a < last:
             after = here
         if here >= level:
-            length += step[i, b]
+            length += step[i, a]
             if before < level:
-                length += step[i, b] * ((here - level) / (here - before) - 0.5)
+                length += step[i, a] * ((here - level) / (here - before) - 0.5)
             if after < level:
-                length += step[i, b] * ((here - level) / (here - after) - 0.5)
+                length += step[i, a] * ((here - level) / (here - after) - 0.5)
         before = here
     return length
 
@@ -185,7 +173,6 @@ def _put_gap(
     i: int,
     first: int,
     last: int,
-    back: bool,
     gap: FloatArray,
     k: int,
     before: bool,
@@ -194,35 +181,18 @@ def _put_gap(
     """Write gap k, and whether there are dashes before and behind it; else the span ends there."""
     seen = 0
     for a in range(first, last + 1):
-        seen += lines.beyond[i, _turned(a, lines.beyond.shape[1], back)]
+        seen += lines.beyond[i, a]
     gap[k, 0] = i
-    gap[k, 1], gap[k, 2] = _ends(lines, i, first, last, back)
+    gap[k, 1], gap[k, 2] = _ends(lines, i, first, last)
     gap[k, 3], gap[k, 4] = before, behind
     gap[k, 5] = seen / (last - first + 1)
 
 
 @inner_kernel
-def _ends(lines: _LaserLines, i: int, first: int, last: int, back: bool) -> tuple[float, float]:
+def _ends(lines: _LaserLines, i: int, first: int, last: int) -> tuple[float, float]:
     """Return both ends of a run of search lines on the laser's line, ascending."""
     along, step = lines.along, lines.step
-    a, b = _turned(first, along.shape[1], back), _turned(last, along.shape[1], back)
-    return along[i, a] - 0.5 * step[i, a], along[i, b] + 0.5 * step[i, b]
-
-
-@inner_kernel
-def _turned(j: int, n: int, back: bool) -> int:
-    return n - 1 - j if back else j
-
-
-@inner_kernel
-def _descends(along: FloatArray) -> bool:
-    first, last = np.nan, np.nan
-    for value in along:
-        if np.isfinite(value):
-            if not np.isfinite(first):
-                first = value
-            last = value
-    return bool(last < first)
+    return along[i, first] - 0.5 * step[i, first], along[i, last] + 0.5 * step[i, last]
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,17 +235,9 @@ class Gaps:
 
 
 @dataclass(frozen=True, slots=True)
-class NetView:
-    """Dashes and gaps of the net in one frame, L lasers; a summary of the `NetSignal`."""
+class NetView(NetFrame):
+    """Dashes and gaps of the net in one frame; a summary of the `NetSignal`."""
 
-    # As in the `NetSignal`.
-    index: int
-    time_s: float
-    range: float
-    origin: FloatArray
-    direction: FloatArray
-    search: FloatArray
-    pixel: float
     # Shape (L,): typical length of laser line per search line, in metres.
     step: FloatArray
     # Shape (L,): share of each laser's dark search lines whose light is seen on something behind
@@ -311,20 +273,17 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
     usable : bool array, shape (L, J), optional
         Search lines to use; the others count as hidden.
     """
-    state = signal.state if usable is None else np.where(usable, signal.state, LineState.HIDDEN)
+    state = signal.state
+    if usable is not None:
+        state = np.where(usable, state, LineState.HIDDEN).astype(np.uint8)
     n_lasers, n_lines = state.shape
     most = n_lasers * n_lines
     dash, gap, span = np.empty((most, 6)), np.empty((2 * most, 6)), np.empty((most, 3))
     usual = np.empty((n_lasers, 2))
-    lines = _LaserLines(
-        np.ascontiguousarray(state, np.uint8),
-        signal.along,
-        signal.step,
-        signal.height,
-        signal.width,
-        signal.beyond,
-    )
-    n, k, m = cut_lines(lines, dash, gap, span, usual)
+    columns = (state, signal.along, signal.step, signal.height, signal.width, signal.beyond)
+    back = _descends(signal.along)[:, None]
+    lines = _LaserLines(*(np.where(back, column[:, ::-1], column) for column in columns))
+    n, k, m = _cut_lines(lines, dash, gap, span, usual)
     laser, along = dash[:n, 0].astype(np.int64), dash[:n, 2].copy()
     return NetView(
         index=signal.index,
@@ -354,6 +313,12 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
         span_laser=span[:m, 0].astype(np.int64),
         span=span[:m, 1:].copy(),
     )
+
+
+def _descends(along: FloatArray) -> BoolArray:
+    """Return whether the places on each laser's line (L, J) fall with the search lines, (L,)."""
+    known = [places[np.isfinite(places)] for places in along]
+    return np.array([len(one) > 0 and one[-1] < one[0] for one in known], np.bool_)
 
 
 def crossings_of(view: NetView) -> Crossings:

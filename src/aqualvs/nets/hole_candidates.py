@@ -176,11 +176,9 @@ def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatA
     again = kind[order][1:] == kind[order][:-1]
     turned = again & (missed[order][1:] != missed[order][:-1])
     n = int(kind.max(initial=0)) + 1
-    pairs = np.bincount(kind[order][1:], again, minlength=n) + _EVIDENCE.before_here
-    turns = (
-        np.bincount(kind[order][1:], turned, minlength=n)
-        + 2.0 * _EVIDENCE.dark * _EVIDENCE.before_here
-    )
+    before = _EVIDENCE.before_here
+    pairs = np.bincount(kind[order][1:], again, minlength=n) + before
+    turns = np.bincount(kind[order][1:], turned, minlength=n) + 2.0 * _EVIDENCE.dark * before
     # Of two in random order, 2 p (1 - p) differ.
     share = 0.5 - np.sqrt(np.maximum(0.25 - 0.5 * turns / pairs, 0.0))
     every = np.bincount(kind, missed, minlength=n) / np.bincount(kind, minlength=n)
@@ -224,6 +222,11 @@ class Disc:
     # Log-likelihood over sound net.
     score: float
 
+    def contains(self, places: FloatArray, margin: float = 0.0) -> BoolArray:
+        """Mark the places (..., 2) in the disc or less than a margin, in metres, beside it."""
+        off = np.moveaxis(places - self.middle, -1, 0)
+        return np.asarray(np.hypot(*off) < self.radius + margin)
+
 
 def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
     """Find discs in which strands are missing, the most certain first.
@@ -244,8 +247,7 @@ def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
         if disc is None:
             break
         found.append(disc)
-        away = np.hypot(*(place - disc.middle).T)
-        weight[away < disc.radius + RIM * bar] = 0.0
+        weight[disc.contains(place, RIM * bar)] = 0.0
     return found
 
 

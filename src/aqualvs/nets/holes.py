@@ -8,11 +8,11 @@ estimated from the dive itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.nets.dashes import NetView
 from aqualvs.nets.hole_candidates import (
     HERE,
@@ -28,21 +28,6 @@ from aqualvs.nets.hole_candidates import (
 )
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
-
-
-class _HoleOptions(NamedTuple):
-    """Missing strands that are one hole."""
-
-    # Missing strands may be a hole if this near to each other, in bars, and with this much
-    # evidence; strands within the last distance determine its edge.
-    near: float = 1.5
-    min_near: float = 9.0
-    around: float = 6.5
-    # Cells farther from the vehicle than this are settled, in metres.
-    settled: float = 2.0
-
-
-_HOLE = _HoleOptions()
 
 _ROW = 1 << 24
 
@@ -88,7 +73,7 @@ class HoleMap:
     _meshes: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     _waiting: list[tuple[Strands, FloatArray, float, int]] = field(default_factory=list)
     _feet: dict[tuple[int, int], Foot] = field(default_factory=dict)
-    _last: FloatArray | None = None
+    _last: FloatArray = field(default_factory=lambda: np.zeros(2))
     _settled_meshes: int = 0
     _mesh: float = 0.0
 
@@ -135,8 +120,9 @@ class HoleMap:
             return
         self._merge_waiting()
         fresh = self._find(lattice)
-        live = [hole for hole in self.holes if hole.piece == self._piece and self._near(hole)]
-        settled = [hole for hole in self.holes if not any(hole is one for one in live)]
+        settled = [
+            hole for hole in self.holes if hole.piece != self._piece or not self._near(hole.place)
+        ]
         # A hole to which the vehicle comes back is the same one.
         self.holes = [
             one for one in settled if not any(_overlap(one, hole) for hole in fresh)
@@ -147,7 +133,7 @@ class HoleMap:
         self._settled_meshes += len(self._meshes)
         self._meshes = np.empty(0, np.int64)
         self._looks, self._feet = Looks(), {}
-        self._piece, self._last = piece, None
+        self._piece = piece
 
     def _merge_waiting(self) -> None:
         strands = [one for one, _, _, _ in self._waiting]
@@ -173,34 +159,32 @@ class HoleMap:
         column, row = np.floor(place / self._mesh).astype(np.int64).T
         self._meshes = np.unique(np.concatenate([self._meshes, column + _ROW * row]))
 
-    def _near(self, hole: Hole) -> bool:
-        """Return whether a hole lies in the part of the map that is not settled."""
-        if self._last is None:
-            return False
-        return bool(np.abs(hole.place - self._last).max() < _HOLE.settled)
+    def _near(self, places: FloatArray) -> BoolArray:
+        """Mark the places (..., 2) in the part of the map that is not settled."""
+        settled = 2.0  # What is farther from the vehicle is settled, in metres.
+        return np.asarray(np.abs(places - self._last).max(axis=-1) < settled)
 
     def _find(self, lattice: NetLattice) -> list[Hole]:
         places, weights = self._looks.places, self._looks.weights()
         bar = lattice.bar
+        # Missing strands may be a hole if this near to each other, in bars, and with this much
+        # evidence; strands within the last distance determine its edge.
+        near, min_near, reach = 1.5, 9.0, 6.5
         likely = np.flatnonzero(weights > 0.0)
-        near = local_sums(places[likely], weights[likely], _HOLE.near * bar)
-        likely = likely[near > _HOLE.min_near]
+        likely = likely[local_sums(places[likely], weights[likely], near * bar) > min_near]
         found, left = [], weights.copy()
         # Discs no farther apart than this are one hole, in bars.
         touch = 1.2
-        for group in _groups(places[likely], 2.0 * _HOLE.near * bar):
+        for group in _groups(places[likely], 2.0 * near * bar):
             seeds = places[likely[group]]
-            low, high = (
-                seeds.min(axis=0) - _HOLE.around * bar,
-                seeds.max(axis=0) + _HOLE.around * bar,
-            )
+            low, high = seeds.min(axis=0) - reach * bar, seeds.max(axis=0) + reach * bar
             around = np.all((places > low) & (places < high), axis=1)
             discs = find_discs(places[around], left[around], bar)
             # Only a part of a hole of another group may lie in these surroundings.
-            discs = [one for one in discs if _contains_any(one, seeds)]
+            discs = [one for one in discs if one.contains(seeds).any()]
             for disc in discs:
                 # Another group also has this hole in its surroundings.
-                left[np.hypot(*(places - disc.middle).T) < disc.radius + RIM * bar] = 0.0
+                left[disc.contains(places, RIM * bar)] = 0.0
             discs = [disc for disc in discs if self._looks.stays_dark(disc.middle, disc.radius)]
             found += [
                 self._hole(lattice, some, places[around], weights[around])
@@ -217,9 +201,7 @@ class HoleMap:
         diameter = float(np.sqrt(4.0 * area / np.pi))
         radius = np.array([disc.radius for disc in discs])
         sigma = float(np.hypot.reduce([2.0 * disc.sigma * disc.radius for disc in discs]))
-        inside = np.zeros(len(places), np.bool_)
-        for disc in discs:
-            inside |= np.hypot(*(places - disc.middle).T) < disc.radius
+        inside = np.any([disc.contains(places) for disc in discs], axis=0)
         return Hole(
             piece=self._piece,
             place=middle,
@@ -236,20 +218,15 @@ class HoleMap:
 
     def _drop_settled(self) -> None:
         """Drop cells far behind the vehicle."""
-        if self._last is None or not len(self._looks.keys):
+        if not len(self._looks.keys):
             return
-        close = np.abs(self._looks.places - self._last).max(axis=1) < _HOLE.settled
-        self._looks = self._looks.kept(close)
+        self._looks = self._looks.kept(self._near(self._looks.places))
         row = np.floor_divide(self._meshes + _ROW // 2, _ROW)
         at = np.stack([self._meshes - row * _ROW, row], axis=1) * self._mesh
-        close = np.abs(at - self._last).max(axis=1) < _HOLE.settled
+        close = self._near(at)
         self._settled_meshes += int(np.count_nonzero(~close))
         self._meshes = self._meshes[close]
-        self._feet = {
-            key: one
-            for key, one in self._feet.items()
-            if np.abs(one[2] - self._last).max() < _HOLE.settled
-        }
+        self._feet = {key: one for key, one in self._feet.items() if self._near(one[2])}
 
 
 def opening_area(lattice: NetLattice) -> float:
@@ -277,25 +254,19 @@ def _groups(places: FloatArray, reach: float) -> list[IntArray]:
     return groups
 
 
-def _contains_any(disc: Disc, places: FloatArray) -> bool:
-    """Return whether some of the places (n, 2) are in a disc."""
-    return bool(np.any(np.hypot(*(places - disc.middle).T) < disc.radius))
-
-
 def _group_touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
     """Group discs that touch."""
     groups: list[list[Disc]] = []
     for disc in discs:
-        mine = [
-            group
-            for group in groups
-            if any(
-                np.hypot(*(disc.middle - one.middle)) < disc.radius + one.radius + apart
-                for one in group
-            )
-        ]
-        groups = [group for group in groups if not any(group is one for one in mine)]
-        groups.append([disc, *(one for group in mine for one in group)])
+        mine, others = [disc], []
+        for group in groups:
+            reach = [disc.radius + one.radius + apart for one in group]
+            away = [np.hypot(*(disc.middle - one.middle)) for one in group]
+            if np.any(np.less(away, reach)):
+                mine += group
+            else:
+                others.append(group)
+        groups = [*others, mine]
     return groups
 
 

@@ -8,7 +8,7 @@ better than half a mesh: pass the vehicle's velocity where another sensor measur
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -64,8 +64,6 @@ class NetLattice:
     waves: FloatArray
     # Log-likelihood per frame over crossings at random.
     score: float
-    # Shape (F,): share of each family's lines that exists: 1, or 1/3 for the bars of hexagons.
-    density: FloatArray
 
     @property
     def basis(self) -> FloatArray:
@@ -98,7 +96,10 @@ def find_lattice(
     before : NetLattice, optional
         Lattice of neighbouring frames; tried first.
     """
-    chosen = _choose(frames)
+    # Least crossings of a usable frame.
+    min_crossings = 5
+    useful = [one for one in frames if len(one.place) >= min_crossings]
+    chosen = _spread(useful, _FIT.max_frames)
     if not chosen:
         return None
     spectrum = Spectrum.of(chosen)
@@ -109,11 +110,11 @@ def find_lattice(
     # A chance result of a few frames is not confirmed by all of them.
     if best is None or best.score < _FIT.min_score:
         return None
-    return _lattice(best, _sigma(best, chosen))
+    return NetLattice(best.mesh, bar_of(best), _sigma(best, chosen), best.families(), best.score)
 
 
 def _search(spectrum: Spectrum) -> Hypothesis | None:
-    rough = [one.scored(score(spectrum, one)) for one in hypotheses(spectrum)]
+    rough = [replace(one, score=score(spectrum, one)) for one in hypotheses(spectrum)]
     rough.sort(key=lambda one: -one.score)
     tried = [refine(one, spectrum, _FIT.first_rounds) for one in rough[: _FIT.followed]]
     tried.sort(key=lambda one: -one.score)
@@ -139,19 +140,9 @@ def _refine_known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
     return None
 
 
-def _choose(frames: Sequence[Crossings]) -> list[Crossings]:
-    """Return some frames, evenly spread, of those with enough crossings."""
-    # Least crossings of a usable frame.
-    min_crossings = 5
-    useful = [one for one in frames if len(one.place) >= min_crossings]
-    return _spread(useful, _FIT.max_frames)
-
-
 def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
     """Return at most `most` frames, evenly spread."""
-    if len(frames) <= most:
-        return list(frames)
-    index = np.linspace(0, len(frames) - 1, most).round().astype(int)
+    index = np.linspace(0, len(frames) - 1, min(len(frames), most)).round().astype(int)
     return [frames[i] for i in index]
 
 
@@ -161,22 +152,9 @@ def _sigma(best: Hypothesis, frames: Sequence[Crossings]) -> float:
     blocks = [b for b in np.array_split(np.arange(len(frames)), _FIT.blocks) if len(b)]
     if len(blocks) < 2:
         return 0.02 * size
-    bars = []
-    for block in blocks:
-        spectrum = Spectrum.of([frames[i] for i in block])
-        bars.append(bar_of(refine(best, spectrum, 3)))
+    spectra = [Spectrum.of([frames[i] for i in block]) for block in blocks]
+    bars = [bar_of(refine(best, spectrum, 3)) for spectrum in spectra]
     return float(np.hypot(np.std(bars, ddof=1) / np.sqrt(len(bars)), _FIT.search_error * size))
-
-
-def _lattice(best: Hypothesis, sigma_bar: float) -> NetLattice:
-    return NetLattice(
-        mesh=best.mesh,
-        bar=bar_of(best),
-        sigma_bar=sigma_bar,
-        waves=best.families(),
-        score=best.score,
-        density=best.density(),
-    )
 
 
 class _TrackOptions(NamedTuple):
@@ -270,12 +248,8 @@ class LatticeFitter:
     ) -> LatticeShift | None:
         """Find the place of the lattice in a frame; None if its crossings do not determine it.
 
-        Parameters
-        ----------
-        expected : array, shape (2,), optional
-            Expected place of the lattice; it selects one of many equivalent shifts.
-        precision : array, shape (2, 2), optional
-            Inverse of the covariance of the expected place.
+        The expected place (2,) selects one of many equivalent shifts; `precision`, shape (2, 2), is
+        the inverse of its covariance.
         """
         if len(crossings.place) < _TRACK.min_crossings:
             return None
@@ -302,24 +276,15 @@ class LatticeFitter:
         """Find the place and velocity common to some frames; None where they are too few.
 
         A single frame may be off, and from frame to frame the net may move by nearly half a mesh:
-        several frames together separate the two.
-
-        Parameters
-        ----------
-        crossings : sequence of Crossings
-            Of the frames; the velocity changes little meanwhile.
-        times_s : array, shape (n,)
-            Their times.
+        several frames together separate the two. The velocity changes little meanwhile.
         """
         usable = [i for i, one in enumerate(crossings) if len(one.place) >= _TRACK.min_crossings]
         if len(usable) < _TRACK.min_frames:
             return None
         size = np.hypot(*self._waves.T)
         longest = size < 1.2 * size.min()
-        waves, share = (
-            self._waves[longest],
-            np.arange(-_TRACK.fastest, _TRACK.fastest + _TRACK.step, _TRACK.step),
-        )
+        waves = self._waves[longest]
+        share = np.arange(-_TRACK.fastest, _TRACK.fastest + _TRACK.step, _TRACK.step)
         velocity = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2)
         rate = velocity @ waves.T
         total = np.zeros(rate.shape, np.complex128)
@@ -382,14 +347,8 @@ def _sums(crossings: Crossings, waves: FloatArray) -> NDArray[np.complex128]:
 def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the plane waves of a lattice, about a knot or the middle of a six-sided opening.
 
-    Returns
-    -------
-    waves : array, shape (Q, 2)
-        Wave vectors.
-    amplitude : array, shape (Q,)
-        Of one crossing.
-    step : array, shape (2, 2)
-        Rows take the lattice to itself.
+    Return wave vectors (Q, 2), their amplitudes (Q,) for one crossing, and two steps, rows of a
+    matrix (2, 2), that take the lattice to itself.
     """
     basis = lattice.basis
     step = _inverse(basis).T
@@ -429,13 +388,10 @@ class NetTrack:
         Current place of the vehicle's foot on the net: right and up of the first one, in metres.
     velocity : array, shape (2,)
         Metres a second.
-    path : float
-        Length of the track, in metres.
     piece : int
         Incremented whenever the track is lost: places of different pieces are not related.
     """
 
-    path: float = 0.0
     piece: int = 0
     _state: FloatArray = field(default_factory=lambda: np.zeros(4))
     _covariance: FloatArray = field(default_factory=_initial_covariance)
@@ -469,8 +425,6 @@ class NetTrack:
 
         Parameters
         ----------
-        fitter : LatticeFitter
-            With the stretch's lattice.
         velocity : array, shape (2,), optional
             Of the vehicle along the net, right and up, if another sensor measures it.
         start : TrackStart, optional
@@ -522,10 +476,8 @@ class NetTrack:
         """Begin a piece of track, from the predicted state if the last piece ended recently."""
         # Standard deviation of the place at such a start, in metres.
         place = 2e-3
-        if start is None:
-            shift = fitter.shift(crossings)
-        else:
-            shift = fitter.shift(crossings, start.place, np.eye(2) / place**2)
+        expected = (start.place, np.eye(2) / place**2) if start else ()
+        shift = fitter.shift(crossings, *expected)
         if shift is None:
             return None
         covariance = _initial_covariance()
@@ -540,5 +492,4 @@ class NetTrack:
         return shift
 
     def _update(self, state: FloatArray, covariance: FloatArray, time_s: float) -> None:
-        self.path += float(np.hypot(*(state - self._state)[:2]))
         self._state, self._covariance, self._time_s = state, covariance, time_s

@@ -35,8 +35,8 @@ class LineState(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class NetSignal:
-    """Signals of the net along the lasers' lines in a frame; L lasers, J search lines (padded)."""
+class NetFrame:
+    """The lasers' lines on the net in one frame, L lasers."""
 
     # As in the `Scan`.
     index: int
@@ -53,6 +53,12 @@ class NetSignal:
     search: FloatArray
     # Size of a pixel on the net, in metres.
     pixel: float
+
+
+@dataclass(frozen=True, slots=True)
+class NetSignal(NetFrame):
+    """Signals of the net along the lasers' lines in a frame; J search lines (padded)."""
+
     # Shape (L, J): place on the laser's line in metres, ascending or descending; NaN where a search
     # line does not meet it.
     along: FloatArray
@@ -104,34 +110,28 @@ class NetReader:
             for field in {rig.shutter.field_of(index) for index in range(2)}
         }
         self.n_lines = max((len(one.lowest) for one in self._laser_bands), default=0)
-        self._lowest, self._highest = self._bands()
-
-    def _bands(self) -> tuple[FloatArray, FloatArray]:
-        """Return the first and last position (L, J) of a detectable stripe on each search line."""
-        lowest = np.full((len(self._laser_bands), self.n_lines), np.inf)
-        highest = np.full(lowest.shape, -np.inf)
+        # First and last position (L, J) of a detectable stripe on each search line.
+        self._lowest = np.full((len(self._laser_bands), self.n_lines), np.inf)
+        self._highest = np.full(self._lowest.shape, -np.inf)
         # The detector needs dark flanks: no stripe is found next to the border.
         border_px = 16.0
         for i, search in enumerate(self._laser_bands):
-            axis = 0 if search.axis is SearchAxis.ALONG_X else 1
-            n, last = len(search.lowest), self.rig.size_px[axis] - 1
-            lowest[i, :n] = np.maximum(search.lowest, border_px)
-            highest[i, :n] = np.minimum(search.highest, last - border_px)
-        return lowest, highest
+            n, last = len(search.lowest), rig.size_px[self._axis[i]] - 1
+            self._lowest[i, :n] = np.maximum(search.lowest, border_px)
+            self._highest[i, :n] = np.minimum(search.highest, last - border_px)
 
     def read(self, scan: Scan) -> NetSignal | None:
         """Return the signal of one frame, or None where its posture was refused."""
         posture = scan.posture
         if not posture:
             return None
-        target = Plane(posture.normal_in_dome, posture.range)
-        net = net_from_dome(target.normal, target.offset)
+        net = net_from_dome(posture.normal_in_dome, posture.range)
         shift_px = self._shift_px[self.rig.shutter.field_of(scan.index)]
         return self._signal(scan, posture, net, self._lines(net, shift_px), shift_px)
 
     def _lines(self, net: SE3, shift_px: FloatArray) -> LaserLines:
         """Follow every laser's line across the net's plane."""
-        n, n_lines = len(self._laser_bands), self.n_lines
+        n = len(self._laser_bands)
         lines = [_line_on(plane, net) for plane in self._planes]
         origin, direction = np.stack(lines, axis=1) if n else np.empty((2, 0, 2))
         # A line across the net is followed this far to each side, in ranges.
@@ -146,15 +146,10 @@ class NetReader:
         for i, sheet in enumerate(self._sheets):
             points[i] = _onto_sheet(points[i], sheet, dome_from_net)
         pixels, valid = self._camera.project(points)
-        found = LaserLines(
-            origin=origin,
-            direction=direction,
-            along=np.full((n, n_lines), np.nan),
-            position=np.full((n, n_lines), np.nan),
-            step=np.zeros((n, n_lines)),
-        )
+        along, position = np.full((2, n, self.n_lines), np.nan)
+        found = LaserLines(origin, direction, along, position, np.zeros(along.shape))
         for i in np.flatnonzero(np.isfinite(direction[:, 0])).tolist():
-            search, axis = self._laser_bands[i], int(self._axis[i])
+            search, axis = self._laser_bands[i], self._axis[i]
             _resample(
                 s,
                 (pixels[i, :, 1 - axis] + 0.5 - shift_px[i]) / search.line_px - 0.5,
@@ -182,7 +177,7 @@ class NetReader:
         off_plane = 0.05
         off = off_plane * distance
         on_net = (np.abs(in_net[:, 2]) < off) & (points.label == Label.NET)
-        height, width = (np.zeros(lines.along.shape) for _ in range(2))
+        height, width = np.zeros((2, *lines.along.shape))
         px = np.sqrt(np.sum(points.points_in_dome**2, axis=1)) / self.rig.focal_px
         folded = (points.label == Label.NET) & ~on_net
         lit = laser[on_net], row[on_net]
@@ -241,7 +236,8 @@ class NetReader:
         px = distance / self.rig.focal_px
         # Width of a stripe where none was measured, in pixels.
         usual_width_px = 5.0
-        wide = np.array([_typical(row, usual_width_px * px) for row in width])
+        lit = [row[row > 0.0] for row in width]
+        wide = np.array([np.median(one) if len(one) else usual_width_px * px for one in lit])
         # Reach of a crossing, where two lasers' stripes disturb each other: in widths, plus pixels.
         crossing_widths, crossing_px = 1.5, 4.0
         margin = crossing_widths * np.maximum(wide[:, None], wide) + crossing_px * px
@@ -331,8 +327,3 @@ def _mark_crossings(
                 # False where one of them does not meet the net.
                 if abs(start + rate * along[i, j]) < margin[i, k]:
                     near[i, j] = True
-
-
-def _typical(widths: FloatArray, otherwise: float) -> float:
-    lit = widths[widths > 0.0]
-    return float(np.median(lit)) if len(lit) else otherwise

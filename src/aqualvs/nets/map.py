@@ -38,19 +38,10 @@ _STYLE: dict[Any, Any] = {
 
 
 def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
-    """Draw the map of a net.
+    """Draw the map of a net; without a stretch the picture says so.
 
-    Parameters
-    ----------
-    wall : UnrolledNet
-        Net to draw; without a stretch the picture says so.
-    paths : sequence of Path
-        Files to write; the suffix (`.png`, `.svg`, `.pdf`) selects the format.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
+    The suffix of each path (`.png`, `.svg`, `.pdf`) selects its format. Raises `OSError` if a file
+    cannot be written.
     """
     import matplotlib as mpl
 
@@ -72,9 +63,12 @@ def _figure(wall: UnrolledNet) -> "Figure":
         figure.text(0.5, 0.5, "no net was seen", ha="center", va="center")
         return figure
     low, high = _extent(wall)
-    n_rows = 1 if wall.by_bearing else _rows(high - low)
-    length = (high[0] - low[0]) / n_rows
-    ratio = 0.35 if wall.by_bearing else float((high[1] - low[1]) / length)
+    # A wall is cut into rows, so that none is a thin line: least height of a row for its width.
+    min_ratio, max_rows = 0.13, 8
+    wide, tall = high - low
+    n_rows = 1 if wall.by_bearing else min(max(math.ceil(min_ratio * (wide / tall)), 1), max_rows)
+    length = wide / n_rows
+    ratio = 0.35 if wall.by_bearing else float(tall / length)
     # Greatest height and least width, in inches: a net passed up or down makes a narrower picture.
     tallest_in, narrowest_in = 8.0, 6.5
     height = min(panel_in * ratio, tallest_in)
@@ -92,7 +86,10 @@ def _figure(wall: UnrolledNet) -> "Figure":
         _label_holes(one, wall)
         _mark_bearings(one, wall, name=row == 0)
     _scale_bar(axes[0], wall, length)
-    figure.suptitle(_title(wall), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    bearing = _single_bearing(wall)
+    faces = "" if bearing is None else f", facing {bearing:.0f}°"
+    title = f"Net wall unrolled{faces}, as seen from the vehicle"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     _legend(figure, wall)
     # Height of the scale of colours on a small map.
     bar_in = 2.4
@@ -117,15 +114,6 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
     if not wall.by_bearing:
         margin[:] = margin.min()
     return low - margin, high + margin
-
-
-def _rows(size: FloatArray) -> int:
-    """Return the number of rows that a wall is cut into, so that no row is a thin line."""
-    # The wall is cut into rows until a row is at least this high for its width, or up to this
-    # number.
-    min_ratio = 0.13
-    max_rows = 8
-    return min(max(math.ceil(min_ratio * float(size[0] / size[1])), 1), max_rows)
 
 
 def _shades(wall: UnrolledNet) -> "ScalarMappable":
@@ -269,19 +257,8 @@ def _scale_bar(axes: "Axes", wall: UnrolledNet, length: float) -> None:
         textcoords="offset points",
         ha="center",
         va="bottom",
-        bbox={
-            "boxstyle": "round,pad=0.15",
-            "facecolor": "white",
-            "edgecolor": "none",
-            "alpha": 0.8,
-        },
+        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
     )
-
-
-def _title(wall: UnrolledNet) -> str:
-    bearing = _single_bearing(wall)
-    faces = "" if bearing is None else f", facing {bearing:.0f}°"
-    return f"Net wall unrolled{faces}, as seen from the vehicle"
 
 
 def _legend(figure: "Figure", wall: UnrolledNet) -> None:
@@ -289,14 +266,13 @@ def _legend(figure: "Figure", wall: UnrolledNet) -> None:
     from matplotlib.patches import Patch
 
     path = Line2D([], [], color=_INK, marker="o", markersize=3.5, markerfacecolor=_PATH)
-    start = Line2D(
-        [], [], linestyle="", marker=">", color=_PATH, markeredgecolor=_INK, markersize=8
+    start, hole = (
+        Line2D([], [], linestyle="", marker=mark, color=fill, markeredgecolor=edge, markersize=size)
+        for mark, fill, edge, size in ((">", _PATH, _INK, 8), ("o", "white", _HOLE, 9))
     )
     shown: dict[str, Line2D | Patch] = {"vehicle’s track": path, "its start": start}
     if wall.holes:
-        shown["hole with its number, to scale"] = Line2D(
-            [], [], linestyle="", marker="o", markersize=9, color="white", markeredgecolor=_HOLE
-        )
+        shown["hole with its number, to scale"] = hole
     if any(fouling_of(one) is None for one in wall.stretches):
         shown["not measured"] = Patch(facecolor=_GREY, edgecolor="white", hatch="////")
     figure.legend(

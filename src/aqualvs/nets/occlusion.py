@@ -17,28 +17,6 @@ from aqualvs.scanning.scan import Label, ScanPoints
 _THINGS = (Label.SOLID, Label.FISH, Label.BUBBLE)
 
 
-class _OcclusionOptions(NamedTuple):
-    """Pieces of light that are one object, and its extent beside its light."""
-
-    # Pieces of light are on one object if at most this many search lines are between them, and at
-    # most this many pixels along these, plus as many for each line. An object with this much light
-    # is not a bubble or speck.
-    between_lines: int = 8
-    between_px: float = 3.0
-    slope_px: float = 1.0
-    large_lines: int = 40
-    # Extent of a small object beside its light: pixels, and a share of its length.
-    beside_px: float = 8.0
-    beside: float = 0.3
-    # The same for a large object, projected on the net: share of its light's length.
-    half_wide: float = 0.5
-    # Number of places along the light on a large object that represent it.
-    few: int = 12
-
-
-_HIDDEN = _OcclusionOptions()
-
-
 class LaserLines(NamedTuple):
     """The lasers' lines across the net's plane; L lasers, J search lines."""
 
@@ -74,18 +52,12 @@ def hidden_lines(
         N of them; points labelled as on the net are never before it.
     in_net : array, shape (N, 3)
         Their places in `net`; z is the distance before the net.
-    row : int array, shape (N,)
-        Their search lines.
-    position : array, shape (N,)
-        Their positions along their search lines, in pixels.
+    row, position : array, shape (N,)
+        Their search lines, and positions along these in pixels.
     line_px : int array, shape (L,)
         Pixels across each laser's search lines.
-    eye : array, shape (3,)
-        The camera in `net`.
-    sources : array, shape (L, 3)
-        Roughly where each laser's light comes from, in `net`.
-    lines : LaserLines
-        Where the lasers' lines run.
+    eye, sources : array, shape (3,) and (L, 3)
+        The camera in `net`, and roughly where each laser's light comes from.
     off : float
         What is nearer to the net's plane is on it, in metres.
 
@@ -108,18 +80,8 @@ def hidden_lines(
     thing = _chain(laser, row[index], position[index])
     order = np.argsort(thing, kind="stable")
     index, laser, thing = index[order], laser[order], thing[order]
-    _hide(
-        thing,
-        laser,
-        row[index],
-        position[index],
-        np.ascontiguousarray(in_net[index]),
-        line_px,
-        eye,
-        sources,
-        lines,
-        hidden,
-    )
+    light = thing, laser, row[index], position[index], np.ascontiguousarray(in_net[index])
+    _hide(*light, line_px, eye, sources, lines, hidden)
     return hidden
 
 
@@ -141,6 +103,9 @@ def light_beyond(
 @kernel
 def _chain(laser: IntArray, row: IntArray, position: FloatArray) -> IntArray:
     """Return the number of the object that each piece of light is on, sorted by search line."""
+    # Pieces of light are on one object if at most this many search lines are between them, and at
+    # most this many pixels along these, plus as many for each line.
+    between_lines, between_px, slope_px = 8, 3.0, 1.0
     n = len(row)
     thing = np.empty(n, np.int64)
     # Last piece of every chain that may continue.
@@ -150,16 +115,13 @@ def _chain(laser: IntArray, row: IntArray, position: FloatArray) -> IntArray:
         kept, best, least = 0, -1, np.inf
         for e in range(n_ends):
             last = ends[e]
-            if laser[last] != laser[k] or row[k] - row[last] > _HIDDEN.between_lines:
+            if laser[last] != laser[k] or row[k] - row[last] > between_lines:
                 continue
             ends[kept] = last
             between = row[k] - row[last]
             away = abs(position[k] - position[last])
-            if (
-                between > 0
-                and away <= _HIDDEN.between_px + _HIDDEN.slope_px * between
-                and away < least
-            ):
+            reach = between_px + slope_px * between
+            if between > 0 and away <= reach and away < least:
                 best, least = kept, away
             kept += 1
         n_ends = kept
@@ -188,13 +150,15 @@ def _hide(
     hidden: BoolArray,
 ) -> None:
     """Mark the places hidden by objects; their light is sorted by object and search line."""
+    # An object with this much light is not a bubble or speck.
+    large_lines = 40
     first = 0
     n = len(thing)
     for k in range(1, n + 1):
         if k < n and thing[k] == thing[first]:
             continue
         i = laser[first]
-        if k - first < _HIDDEN.large_lines:
+        if k - first < large_lines:
             _hide_beside(row[first:k], position[first:k], line_px[i], lines.position[i], hidden[i])
         else:
             _hide_behind(in_net[first:k], eye, lines, hidden)
@@ -207,7 +171,9 @@ def _hide_beside(
     row: IntArray, position: FloatArray, line_px: int, expected: FloatArray, hidden: BoolArray
 ) -> None:
     """Mark where a laser's line passes, in the picture, beside its light on a small object."""
-    reach = _HIDDEN.beside_px + _HIDDEN.beside * line_px * (row[-1] - row[0])
+    # Extent of a small object beside its light: pixels, and a share of its length.
+    beside_px, beside = 8.0, 0.3
+    reach = beside_px + beside * line_px * (row[-1] - row[0])
     beyond = int(reach / line_px)
     at = 0
     for j in range(max(row[0] - beyond, 0), min(row[-1] + beyond + 1, len(hidden))):
@@ -241,9 +207,12 @@ def _hide_behind(in_net: FloatArray, eye: FloatArray, lines: LaserLines, hidden:
         on_net[k, 0], on_net[k, 1] = _cast(in_net[k], eye)
     wide = on_net[:, 0].max() - on_net[:, 0].min()
     high = on_net[:, 1].max() - on_net[:, 1].min()
-    radius = _HIDDEN.half_wide * np.hypot(wide, high)
-    for few in range(_HIDDEN.few):
-        x, y = on_net[few * (n - 1) // (_HIDDEN.few - 1)]
+    # Half the width of a large object, as a share of its light's length on the net; and number of
+    # places along the light that represent it.
+    half_wide, n_places = 0.5, 12
+    radius = half_wide * np.hypot(wide, high)
+    for few in range(n_places):
+        x, y = on_net[few * (n - 1) // (n_places - 1)]
         for i in range(along.shape[0]):
             # Part of the line within that distance of the place.
             s = (x - origin[i, 0]) * direction[i, 0] + (y - origin[i, 1]) * direction[i, 1]

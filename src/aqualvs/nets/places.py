@@ -168,10 +168,9 @@ class AlignedLog:
         found: dict[str, Any] = {"file": self.log.name, "used": self.places is not None}
         if isinstance(self.offset, OffsetRefusal):
             return found | {"refused": self.offset.reason}
-        digits = 3
         return found | {
-            "offset_s": round(self.offset.offset_s, digits),
-            "sigma_offset_s": round(self.offset.sigma_s, digits),
+            "offset_s": round(self.offset.offset_s, 3),
+            "sigma_offset_s": round(self.offset.sigma_s, 3),
             "offset_from": self.offset.how,
             "covered": round(self.covered, 4),
         }
@@ -195,19 +194,9 @@ def align_log(
 ) -> AlignedLog:
     """Align a log with a dive's clock.
 
-    Parameters
-    ----------
-    log : VehicleLog
-        Of the same dive.
-    offset_s : float or None
-        Log time minus dive time, where the user knows it.
-    video : Path or None
-        Video whose clock may be used.
-
-    Notes
-    -----
-    Without an offset from the user it is estimated from the motion common to both; the clocks of
-    video and log help where that is ambiguous, and replace it where there is no motion.
+    Without an offset from the user (log time minus dive time) it is estimated from the motion
+    common to both; the clocks of video and log help where that is ambiguous, and replace it where
+    there is no motion.
     """
     given = offset_s is not None and TimeOffset(offset_s, 0.0, None, "given by the user")
     offset = given or _estimate_offset(log, postures, video)
@@ -280,17 +269,9 @@ def place_net(
 ) -> NetPlaces:
     """Place stretches and holes on the unrolled net.
 
-    Parameters
-    ----------
-    stretches, holes : sequence
-        As `NetCondition` gives them, in the order of time.
-    postures : DivePostures
-        Of the same dive.
-    vehicle : VehiclePlaces, optional
-        The vehicle's log, aligned with the dive's clock.
+    Stretches and holes are those of `NetCondition`, in the order of time; the vehicle's log is
+    aligned with the dive's clock.
 
-    Notes
-    -----
     The net's depth at the foot of the perpendicular follows from the vehicle's depth and attitude
     and from the posture; where the log has no attitude the vehicle counts as level. Its mean over
     15 s before and after corrects the track's height, which limits both the log's noise and the
@@ -344,18 +325,20 @@ class _Nodes:
         time_s = np.array([stretches[0].begin_s, *(one.end_s for one in stretches)])
         raw = np.array([stretches[0].begin_place, *(one.place for one in stretches)])
         piece = np.array([0, *(one.piece for one in stretches)])
-        tracked = _tracked(stretches, raw, piece)
+        # Whether the track gives the length of each stretch.
+        moved = np.any(np.diff(raw, axis=0) != 0.0, axis=1)
+        seen_there = np.array([one.lattice is not None for one in stretches])
+        tracked = (np.diff(piece) == 0) & (moved | seen_there)
         run = np.concatenate([[0], np.cumsum(~tracked)])
         upright = seen.upright()
         steps = _steps(np.diff(raw, axis=0) * [1.0, upright], np.diff(time_s), tracked)
         along, up = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]).T
-        placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.SPEED for r in run]
-        if not tracked.any():
-            placed_by = [PlacedBy.NOTHING] * len(run)
-        turned = _place_round_cage(along, run, seen.bearings(time_s))
+        joined_by, turned = PlacedBy.SPEED, _place_round_cage(along, run, seen.bearings(time_s))
         if turned is not None:
-            along = turned
-            placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.BEARING for r in run]
+            along, joined_by = turned, PlacedBy.BEARING
+        placed_by = [joined_by if r else PlacedBy.TRACK for r in run]
+        if turned is None and not tracked.any():
+            placed_by = [PlacedBy.NOTHING] * len(run)
         depth = _log_corrected_depths(time_s, up, run, seen.depths(time_s))
         return cls(time_s, along, up, raw, piece, run, upright, depth, placed_by)
 
@@ -405,13 +388,6 @@ class _Nodes:
             heading=seen.heading(hole.time_s),
             placed_by=placed_by,
         )
-
-
-def _tracked(stretches: Sequence[NetStretch], raw: FloatArray, piece: IntArray) -> BoolArray:
-    """Return for every stretch whether the track gives its length."""
-    moved = np.any(np.diff(raw, axis=0) != 0.0, axis=1)
-    seen = np.array([one.lattice is not None for one in stretches])
-    return np.asarray((np.diff(piece) == 0) & (moved | seen), np.bool_)
 
 
 def _steps(steps: FloatArray, elapsed: FloatArray, tracked: BoolArray) -> FloatArray:

@@ -12,11 +12,11 @@ metre of line separates a lattice from its multiples and fractions; equal length
 mesh separate it from chance.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import pairwise
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,8 +53,7 @@ _UPWARD: FloatArray = np.arange(-2.0 * STEP, HIGHEST + STEP, STEP)
 _APART = 7.5e-3
 _MAX_ON_GRID = 12
 
-
-Swings: TypeAlias = NDArray[np.complex64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,25 +80,12 @@ class Spectrum:
 
     Parameters
     ----------
-    crossings : AllCrossings
-        Of F frames.
     lines : array, shape (n, 3)
         Direction and seen length of every line of all frames; zero where there is none.
     laser : int array, shape (n,)
         Its laser.
     lit : float
         Share of the lines that is lit.
-
-    Attributes
-    ----------
-    crossings, lines, laser, lit
-        As given.
-    n_frames, n_crossings : int
-        Frames and all crossings.
-    per_frame : float
-        Crossings in a frame, on average.
-    seen : array, shape (L,)
-        Crossings of each laser.
     """
 
     def __init__(
@@ -108,6 +94,7 @@ class Spectrum:
         self.crossings, self.lines, self.laser, self.lit = crossings, lines, laser, lit
         self.n_frames, self.n_crossings = len(crossings.start) - 1, len(crossings.place)
         self.per_frame = self.n_crossings / self.n_frames
+        # Crossings of each laser, shape (L,).
         seen = np.bincount(crossings.line, minlength=len(lines))
         self.seen = np.bincount(laser, seen, minlength=laser.max(initial=0) + 1)
 
@@ -186,7 +173,7 @@ class Spectrum:
         return size, angle, highest[i, j]
 
 
-def _swings(place: FloatArray, first: float, n: int) -> Swings:
+def _swings(place: FloatArray, first: float, n: int) -> NDArray[np.complex64]:
     """Return the waves of frequencies first, first + STEP and so on at places (N,), shape (N, n).
 
     Each is the product of a coarse and a fine one, of which few have to be computed.
@@ -225,6 +212,11 @@ class Mesh(StrEnum):
     SIX_SIDED = "six-sided"
     """Hexagons: three families of short bars."""
 
+    @property
+    def density(self) -> float:
+        """Share of each family's lines that exists."""
+        return 1.0 if self is Mesh.FOUR_SIDED else 1.0 / 3.0
+
 
 # Coordinates in which lattices may differ: wave and axis.
 _COORDINATES = {Mesh.FOUR_SIDED: ((0, 0), (0, 1), (1, 0), (1, 1)), Mesh.SIX_SIDED: ((0, 0), (0, 1))}
@@ -238,20 +230,12 @@ class Hypothesis:
     basis: FloatArray
     score: float = -np.inf
 
-    def scored(self, score: float) -> "Hypothesis":
-        """Return the same with a score."""
-        return Hypothesis(self.mesh, self.basis, score)
-
     def families(self) -> FloatArray:
         """Wave vectors of the strands."""
         a, b = self.basis
         if self.mesh is Mesh.FOUR_SIDED:
             return self.basis
         return np.array([a + b, 2.0 * b - a, 2.0 * a - b])
-
-    def density(self) -> FloatArray:
-        """Return the share of each family's lines that exists."""
-        return np.ones(2) if self.mesh is Mesh.FOUR_SIDED else np.full(3, 1.0 / 3.0)
 
 
 def score(spectrum: Spectrum, hypothesis: Hypothesis) -> float:
@@ -267,7 +251,7 @@ def score(spectrum: Spectrum, hypothesis: Hypothesis) -> float:
         spectrum.lit,
         spectrum.n_frames,
         families,
-        float(hypothesis.density()[0]),
+        hypothesis.mesh.density,
     )
     return gain - off - _uneven(hypothesis)
 
@@ -318,8 +302,7 @@ def _four_sided(
     max_of_rest = 6
     # Families that run more nearly alike than this have no mesh between them.
     min_angle = np.deg2rad(25.0)
-    for k, i in _best_waves(gain, size, angle, _SEARCH.kept):
-        a = size[k] * np.array([np.cos(angle[i]), np.sin(angle[i])])
+    for k, i, a in _best_waves(gain, size, angle, _SEARCH.kept):
         rest = spectrum.without(a)
         if rest.n_crossings == 0:
             continue
@@ -327,30 +310,29 @@ def _four_sided(
         between = np.abs((angle - angle[i] + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
         left = left - 0.5 * (np.log(size / size[k])[:, None] / _SEARCH.even) ** 2
         left[:, between < min_angle] = -np.inf
-        for m, j in _best_waves(left, size, angle, _SEARCH.seconds):
-            b = size[m] * np.array([np.cos(angle[j]), np.sin(angle[j])])
+        for _, _, b in _best_waves(left, size, angle, _SEARCH.seconds):
             found.append(Hypothesis(Mesh.FOUR_SIDED, np.array([a, b])))
     return found
 
 
 def _best_waves(
     gain: FloatArray, size: FloatArray, angle: FloatArray, n: int
-) -> list[tuple[int, int]]:
-    """Return the rows and columns of the best waves that are not neighbours, best first."""
+) -> list[tuple[int, int, FloatArray]]:
+    """Return rows, columns and vectors of the best waves that are not neighbours, best first."""
     gain = np.where(
         ((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / _SEARCH.shortest_bar))[:, None], gain, -np.inf
     )
+    waves = ((k, i, _wave(size[k], angle[i])) for k, i in _best_cells(gain))
+    return _first_apart(waves, lambda one, other: _distance(one[2], other[2]), n)
+
+
+def _best_cells(gain: FloatArray) -> Iterator[tuple[int, int]]:
     order = np.argsort(gain, axis=None)[::-1][: _SEARCH.tried]
-    found: list[tuple[int, int]] = []
-    waves: list[FloatArray] = []
-    for k, i in zip(*np.unravel_index(order, gain.shape), strict=True):
-        wave = size[k] * np.array([np.cos(angle[i]), np.sin(angle[i])])
-        if all(_distance(wave, other) > _SEARCH.apart for other in waves):
-            found.append((int(k), int(i)))
-            waves.append(wave)
-        if len(found) == n:
-            break
-    return found
+    return zip(*np.unravel_index(order, gain.shape), strict=True)
+
+
+def _wave(size: float, angle: float) -> FloatArray:
+    return size * np.array([np.cos(angle), np.sin(angle)])
 
 
 def _six_sided(
@@ -374,22 +356,19 @@ def _six_sided(
         beside = (at + sixth) % N_ANGLES
         near = longer < len(size)
         total[near] += bars[longer[near]][:, beside]
-    order = np.argsort(total, axis=None)[::-1][: _SEARCH.tried]
-    found = []
-    for k, i in zip(*np.unravel_index(order, total.shape), strict=True):
-        a = size[rows[k]] * np.array([np.cos(angle[i]), np.sin(angle[i])])
-        found.append(Hypothesis(Mesh.SIX_SIDED, np.array([a, turned(np.pi / 3.0) @ a])))
-    return _spread_out(found)
+    waves = (_wave(size[rows[k]], angle[i]) for k, i in _best_cells(total))
+    found = (Hypothesis(Mesh.SIX_SIDED, np.array([a, turned(np.pi / 3.0) @ a])) for a in waves)
+    return _first_apart(found, _apart, _SEARCH.kept)
 
 
-def _spread_out(ordered: list[Hypothesis]) -> list[Hypothesis]:
-    """Return the best of each group of neighbours."""
-    kept: list[Hypothesis] = []
+def _first_apart(ordered: Iterable[T], distance: Callable[[T, T], float], n: int) -> list[T]:
+    """Return the first `n` that are no neighbours of an earlier one."""
+    kept: list[T] = []
     for one in ordered:
-        if len(kept) == _SEARCH.kept:
-            break
-        if all(_apart(one, other) > _SEARCH.apart for other in kept):
+        if all(distance(one, other) > _SEARCH.apart for other in kept):
             kept.append(one)
+        if len(kept) == n:
+            break
     return kept
 
 
@@ -415,7 +394,7 @@ def refine(start: Hypothesis, spectrum: Spectrum, rounds: int) -> Hypothesis:
 
     In each round every coordinate is tried to either side.
     """
-    best = start.scored(score(spectrum, start))
+    best = replace(start, score=score(spectrum, start))
     step = 0.5 * STEP
     for _ in range(rounds):
         before = best
@@ -424,7 +403,7 @@ def refine(start: Hypothesis, spectrum: Spectrum, rounds: int) -> Hypothesis:
                 moved = _moved(best, wave, axis, shift)
                 found = score(spectrum, moved)
                 if found > best.score:
-                    best = moved.scored(found)
+                    best = replace(moved, score=found)
                     break
         if best is before:
             step *= 0.5

@@ -11,7 +11,7 @@ import io
 import itertools
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -69,16 +69,7 @@ def unroll(
 ) -> UnrolledNet:
     """Project stretches and holes to the plane of the unrolled net.
 
-    Parameters
-    ----------
-    stretches, holes : sequence
-        Of a dive.
-    places : NetPlaces
-        Theirs.
-    rig : Rig
-        Whose picture tells how much of the net is seen at a time.
-    postures : DivePostures
-        Of the same dive.
+    All are of one dive; the rig's picture tells how much of the net is seen at a time.
     """
     nodes = [*places.begin[:1], *places.end]
     by_bearing = all(one.placed_by is PlacedBy.NOTHING for one in nodes) and any(
@@ -206,16 +197,16 @@ def _edge(reach: FloatArray, beside: FloatArray | None) -> FloatArray:
 
 Cell: TypeAlias = int | float | str | None
 
-_PLACE = ("along_m", "placed_by", "depth_m", "bearing_deg")
+_PLACE = ("along_m", "placed_by", "depth_m", "bearing_deg", "heading_deg")
 NET_COLUMNS = (
     *("stretch", "first_frame", "last_frame", "begin_s", "end_s", "n_frames"),
-    *("piece", "right_m", "up_m", *_PLACE, "heading_deg", "range_m"),
+    *("piece", "right_m", "up_m", *_PLACE, "range_m"),
     *("mesh", "bar_mm", "sigma_bar_mm", "twine_mm", "sigma_twine_mm"),
     *("solidity", "sigma_solidity", "clean_solidity", "fouling", "n_strands", "seen_m"),
 )
 """Columns of `net.csv`, one row for every stretch; empty where not measured or not known."""
 HOLE_COLUMNS = (
-    *("hole", "piece", "right_m", "up_m", *_PLACE, "heading_deg"),
+    *("hole", "piece", "right_m", "up_m", *_PLACE),
     *("width_mm", "height_mm", "diameter_mm", "sigma_diameter_mm", "missing_meshes"),
     *("frame", "time_s", "n_looks", "picture_frame", "u_px", "v_px", "diameter_px"),
 )
@@ -226,18 +217,14 @@ _DIGITS = {"s": 3, "m": 3, "deg": 1, "mm": 2, "px": 1}
 
 def stretch_rows(wall: UnrolledNet) -> list[dict[str, Cell]]:
     """Return the rows of `net.csv`."""
-    return [
-        _rounded(_stretch(i, one, place))
-        for i, (one, place) in enumerate(zip(wall.stretches, wall.places.middle, strict=True))
-    ]
+    pairs = zip(wall.stretches, wall.places.middle, strict=True)
+    return [_stretch_row(i, one, place) for i, (one, place) in enumerate(pairs, start=1)]
 
 
 def hole_rows(wall: UnrolledNet) -> list[dict[str, Cell]]:
     """Return the rows of `holes.csv`."""
-    return [
-        _rounded(_hole(i, hole, place, wall.holes_px[i]))
-        for i, (hole, place) in enumerate(zip(wall.holes, wall.places.holes, strict=True))
-    ]
+    found = zip(wall.holes, wall.places.holes, wall.holes_px, strict=True)
+    return [_hole_row(i, *one) for i, one in enumerate(found, start=1)]
 
 
 def fouling_of(stretch: NetStretch) -> float | None:
@@ -264,24 +251,14 @@ def write_table(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
 def write_geojson(path: Path, wall: UnrolledNet, facts: Mapping[str, Any]) -> None:
     """Write stretches (Polygon) and holes (Point) in the plane of the unrolled net.
 
-    Parameters
-    ----------
-    path : Path
-        A FeatureCollection as in RFC 7946, but for its coordinates: they are local.
-    wall : UnrolledNet
-        What to write; properties are the columns of the tables.
-    facts : mapping
-        What else belongs to it, for the foreign member `aqualvs_net`.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    The file is a FeatureCollection as in RFC 7946, but for its coordinates: they are local.
+    Properties are the columns of the tables, and `facts` go into the foreign member `aqualvs_net`.
+    Raises `OSError` as the system says it.
     """
     content = {
         "type": "FeatureCollection",
         "aqualvs_net": {"coordinates": coordinates(wall), **facts},
-        "features": [*_polygons(wall), *_points(wall)],
+        "features": list(_features(wall)),
     }
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -298,56 +275,44 @@ def coordinates(wall: UnrolledNet) -> dict[str, str]:
     }
 
 
-def _stretch(i: int, one: NetStretch, place: NetPlace) -> dict[str, Cell]:
+def _stretch_row(i: int, one: NetStretch, place: NetPlace) -> dict[str, Cell]:
     lattice, twine, mm = one.lattice, one.twine, 1e3
+    mesh: Sequence[Cell] = (None,) * 3
+    if lattice is not None:
+        mesh = lattice.mesh, mm * lattice.bar, mm * lattice.sigma_bar
     cells: tuple[Cell, ...] = (
-        *(i + 1, one.first_frame, one.last_frame, one.begin_s, one.end_s, one.n_frames),
-        *(one.piece, *map(float, one.place), *_place_cells(place)),
-        *(_degrees(place.heading), one.range),
-        *(
-            (None,) * 3
-            if lattice is None
-            else (lattice.mesh, mm * lattice.bar, mm * lattice.sigma_bar)
-        ),
+        *(i, one.first_frame, one.last_frame, one.begin_s, one.end_s, one.n_frames),
+        *(one.piece, *map(float, one.place), *_place_cells(place), one.range, *mesh),
         *((None,) * 2 if twine is None else (mm * twine.thickness, mm * twine.sigma)),
         *(one.solidity, one.sigma_solidity, one.clean_solidity, fouling_of(one)),
         *(None if lattice is None else one.n_strands, one.seen_length),
     )
-    return dict(zip(NET_COLUMNS, cells, strict=True))
+    return {name: _rounded(name, cell) for name, cell in zip(NET_COLUMNS, cells, strict=True)}
 
 
-def _hole(i: int, hole: Hole, place: NetPlace, pixels: FloatArray) -> dict[str, Cell]:
+def _hole_row(i: int, hole: Hole, place: NetPlace, pixels: FloatArray) -> dict[str, Cell]:
     mm = 1e3
     cells: tuple[Cell, ...] = (
-        *(
-            i + 1,
-            hole.piece,
-            *map(float, hole.place),
-            *_place_cells(place),
-            _degrees(place.heading),
-        ),
+        *(i, hole.piece, *map(float, hole.place), *_place_cells(place)),
         *(mm * hole.extent[0], mm * hole.extent[1]),
         *(mm * hole.diameter, mm * hole.sigma_diameter, hole.missing_meshes),
         *(hole.frame, hole.time_s, hole.n_looks),
         *((int(pixels[0]), *map(float, pixels[1:])) if np.isfinite(pixels[0]) else (None,) * 4),
     )
-    return dict(zip(HOLE_COLUMNS, cells, strict=True))
+    return {name: _rounded(name, cell) for name, cell in zip(HOLE_COLUMNS, cells, strict=True)}
 
 
 def _place_cells(place: NetPlace) -> tuple[Cell, ...]:
-    return place.along, place.placed_by, place.depth, _degrees(place.bearing)
+    bearing, heading = _degrees(place.bearing), _degrees(place.heading)
+    return place.along, place.placed_by, place.depth, bearing, heading
 
 
 def _degrees(angle: float | None) -> float | None:
     return None if angle is None else float(np.rad2deg(angle)) % 360.0
 
 
-def _rounded(row: Mapping[str, Cell]) -> dict[str, Cell]:
-    """Return a row with no more digits than the numbers are worth, and plain types."""
-    return {name: _round(name, cell) for name, cell in row.items()}
-
-
-def _round(name: str, cell: Cell) -> Cell:
+def _rounded(name: str, cell: Cell) -> Cell:
+    """Return a cell with no more digits than the number is worth, and of a plain type."""
     if isinstance(cell, str):
         return str(cell)
     if cell is None or isinstance(cell, int):
@@ -357,41 +322,30 @@ def _round(name: str, cell: Cell) -> Cell:
     return round(float(cell), _DIGITS.get(name.rsplit("_", 1)[-1], share_digits)) + 0.0
 
 
-def _polygons(wall: UnrolledNet) -> Iterator[dict[str, Any]]:
-    for row, outline in zip(stretch_rows(wall), wall.outlines, strict=True):
-        ring = _corners(np.concatenate([outline, outline[:1]]))
-        yield _feature("stretch", row, {"type": "Polygon", "coordinates": [ring]})
+def _features(wall: UnrolledNet) -> Iterator[dict[str, Any]]:
+    rings = [[_local([*outline, outline[0]])] for outline in wall.outlines]
+    for kind, shape, rows, places in (
+        ("stretch", "Polygon", stretch_rows(wall), rings),
+        ("hole", "Point", hole_rows(wall), _local(wall.holes_xy)),
+    ):
+        for row, place in zip(rows, places, strict=True):
+            yield {
+                "type": "Feature",
+                "id": f"{kind}-{row[kind]}",
+                "properties": {"kind": kind, **row},
+                "geometry": {"type": shape, "coordinates": place},
+            }
 
 
-def _points(wall: UnrolledNet) -> Iterator[dict[str, Any]]:
-    for row, middle in zip(hole_rows(wall), wall.holes_xy, strict=True):
-        yield _feature("hole", row, {"type": "Point", "coordinates": _corners(middle[None])[0]})
-
-
-def _feature(kind: str, row: Mapping[str, Cell], geometry: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "type": "Feature",
-        "id": f"{kind}-{row[kind]}",
-        "properties": {"kind": kind, **row},
-        "geometry": geometry,
-    }
-
-
-def _corners(places: FloatArray) -> list[list[float]]:
+def _local(places: Iterable[FloatArray]) -> list[Any]:
     return [[round(float(x), 4) + 0.0, round(float(y), 4) + 0.0] for x, y in places]
 
 
 def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
     """Return the numbers that sum a dive up; None where not measured.
 
-    Parameters
-    ----------
-    wall : UnrolledNet
-        What was found.
-    area : float
-        Looked at for holes, in square metres.
-    n_frames, n_net_frames : int
-        Frames of the dive, and those with a posture to a net.
+    `area`: looked at for holes, in square metres. `n_frames`, `n_net_frames`: frames of the dive,
+    and those with a posture to a net.
     """
     stretches = wall.stretches
     largest = max((hole.diameter for hole in wall.holes), default=None)
@@ -421,7 +375,7 @@ def net_lines(wall: UnrolledNet, area: float, n_frames: int) -> list[str]:
     if not wall.stretches:
         return [f"no net was seen in {count_text(n_frames, 'frame')}"]
     facts = net_dict(wall, area, n_frames, sum(one.n_frames for one in wall.stretches))
-    lines = [_mesh_line(facts), *_fouling_lines(wall, facts), *_hole_lines(wall, facts)]
+    lines = [_mesh_line(facts), _fouling_line(wall, facts), *_hole_lines(wall, facts)]
     return [*lines, *(f"warning: {words}" for words in track_warnings(facts))]
 
 
@@ -472,34 +426,33 @@ def _mesh_line(facts: dict[str, Any]) -> str:
     return words if facts["twine_mm"] is None else f"{words}, twine {facts['twine_mm']:.1f} mm"
 
 
-def _fouling_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
+def _fouling_line(wall: UnrolledNet, facts: dict[str, Any]) -> str:
     if facts["fouling"] is None:
-        return ["solidity: not measured in any stretch"]
+        return "solidity: not measured in any stretch"
     clean = facts["solidity"] - facts["fouling"]
     fouling = [fouling_of(one) for one in wall.stretches]
     worst = int(np.argmax([-np.inf if value is None else value for value in fouling]))
-    return [
+    return (
         f"solidity {facts['solidity']:.2f}, of bare twine {clean:.2f}: "
         f"fouling {facts['fouling']:+.2f}; most at {place_text(wall.places.middle[worst])}: "
         f"{fouling[worst]:+.2f}"
-    ]
+    )
 
 
 def _hole_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     n = len(wall.holes)
-    seen = (
-        f"looked at {facts['area_m2']:.2f} m² of net over {facts['way_m']:.1f} m: {hole_count(n)}"
-    )
-    max_listed = 20
+    area, way, max_listed = facts["area_m2"], facts["way_m"], 20
+    lines = [f"looked at {area:.2f} m² of net over {way:.1f} m: {hole_count(n)}"]
     order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:max_listed]
-    lines = [
-        f"  {i + 1}: {size_text(hole)}, {hole.missing_meshes:.0f} meshes: {place_text(place)}, "
-        f"at {clock(hole.time_s)} (frame {hole.frame})"
-        for i, hole, place in ((i, wall.holes[i], wall.places.holes[i]) for i in sorted(order))
-    ]
+    for i in sorted(order):
+        hole, place = wall.holes[i], wall.places.holes[i]
+        lines.append(
+            f"  {i + 1}: {size_text(hole)}, {hole.missing_meshes:.0f} meshes: {place_text(place)}, "
+            f"at {clock(hole.time_s)} (frame {hole.frame})"
+        )
     if n > max_listed:
         lines.append(f"  and {n - max_listed} smaller ones, see holes.csv")
-    return [seen, *lines]
+    return lines
 
 
 def _way(wall: UnrolledNet) -> float:

@@ -102,7 +102,6 @@ def net_request(
     return None
 
 
-_KINDS = ", ".join(kind.value for kind in TargetKind)
 # Crossings with a line on a bar's length, on the mean of all directions (Crofton).
 _CROSSINGS = {
     "diamond": 4.0 / math.pi,
@@ -126,19 +125,13 @@ class NetFacts:
     bar: float  # Length of one side of an opening, in metres.
     twine: float | None = None  # Diameter of the twine, in metres.
 
-    @property
-    def crossings_per_bar(self) -> float:
-        """Strands that a line crosses on the length of a bar, on the mean of all directions."""
-        return _CROSSINGS[self.mesh]
-
     def filter_lengths(self) -> dict[str, float]:
         """Return the lengths of `MeshFilterOptions` that follow from the net, in metres."""
         least, greatest = (self.bar * share for share in _DISTANCES[self.mesh])
         lengths = {"r_min": least, "r_max": greatest}
-        # Reflection over twine, as for the paper's net (section 5.2).
-        reflection = 5.0
         if self.twine is not None:
-            lengths["rd_theta"] = min(reflection * self.twine, least)
+            # Reflection over twine, as for the paper's net (section 5.2).
+            lengths["rd_theta"] = min(5.0 * self.twine, least)
         return lengths
 
 
@@ -195,24 +188,23 @@ def target_dict(text: str) -> TargetFacts:
         return TargetFacts(TargetKind(text))
     path = Path(text)
     if not path.exists():
-        raise OptionError(f"--target {text}: neither a file nor one of {_KINDS}")
+        raise OptionError(f"--target {text}: neither a file nor one of {', '.join(TargetKind)}")
     content = read_yaml(path, "a net.yaml", OptionError)
     if not isinstance(content, dict):
         raise OptionError(f"{path}: holds no keys; write for example 'kind: net'")
     file = validated(_TargetFile, content, path, OptionError, _WORDS)
-    net, given = file.net, file.mesh_filter
-    said = None
-    if net is not None:
-        twine = None if net.twine_mm is None else 1e-3 * net.twine_mm
+    said, lengths = None, {}
+    if (net := file.net) is not None:
         if net.twine_mm is not None and net.twine_mm >= net.bar_mm:
             raise OptionError(
                 f"{path}: net.twine_mm is {net.twine_mm:g}, not thinner than the bar of "
                 f"{net.bar_mm:g} mm; write the diameter of one twine in millimetres"
             )
+        twine = None if net.twine_mm is None else 1e-3 * net.twine_mm
         said = NetFacts(net.mesh, 1e-3 * net.bar_mm, twine)
-    lengths = {} if said is None else said.filter_lengths()
-    if given is not None:
-        own = given.model_dump(exclude_none=True)
+        lengths = said.filter_lengths()
+    if file.mesh_filter is not None:
+        own = file.mesh_filter.model_dump(exclude_none=True)
         lengths |= {name.removesuffix("_mm"): 1e-3 * value for name, value in own.items()}
     facts = TargetFacts(TargetKind(file.kind), lengths, said)
     try:
@@ -263,9 +255,7 @@ class NetCheck:
         found: dict[str, Any] = {"bar_said_mm": round(1e3 * self.said.bar, 2)}
         if bar is not None:
             found["bar_seen_mm"] = round(1e3 * bar, 1)
-        found["n_frames"] = len(self.bars)
-        found["words"] = self.sentence()
-        return found
+        return found | {"n_frames": len(self.bars), "words": self.sentence()}
 
 
 def net_check(target: str, rig: Rig) -> NetCheck | None:
@@ -285,14 +275,8 @@ def net_check(target: str, rig: Rig) -> NetCheck | None:
 def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
     """Return the likely bar from the distances between strands in one frame, in metres.
 
-    Parameters
-    ----------
-    scan : Scan
-        Its points labelled net are used.
-    planes : sequence of Plane
-        Of the lasers, in `dome`.
-    said : NetFacts
-        Its shape of mesh is taken as given.
+    Of points labelled net, with the planes of the lasers in `dome`; the shape of the mesh is taken
+    as `said`.
     """
     min_lasers = 2
     posture = scan.posture
@@ -312,7 +296,7 @@ def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
     # Strands that meet at a knot count once and dim ones are missed: found on random simulated
     # nets.
     missed = 1.2
-    return float(said.crossings_per_bar / (missed * np.mean(densities)))
+    return float(_CROSSINGS[said.mesh] / (missed * np.mean(densities)))
 
 
 def strand_distance(along: FloatArray) -> float | None:

@@ -39,16 +39,15 @@ def picture_view(shots: Sequence[PictureShot]) -> Raw:
 
 
 def _figure(shot: PictureShot, index: int, count: int) -> str:
-    all_bytes = 340_000
-    max_bytes = 130_000
-    all_marks = 6000
+    all_bytes, max_bytes, all_marks = 340_000, 130_000, 6000
     address, width, height = _embedded(shot.image, min(max_bytes, all_bytes // count))
     scale = width / shot.image.shape[1]
-    body = [f'<image href="{address}" width="{width}" height="{height}"/>']
     limit = all_marks // count // max(len(shot.points), 1)
-    for layer, overlay in enumerate(shot.points):
-        name = f"marks-{index}-{layer}"
-        body.append(_marks(overlay, name, scale, width / 640.0, limit))
+    body = [f'<image href="{address}" width="{width}" height="{height}"/>']
+    body += [
+        _marks(overlay, f"marks-{index}-{layer}", scale, width / 640.0, limit)
+        for layer, overlay in enumerate(shot.points)
+    ]
     shown = ", ".join(overlay.label for overlay in shot.points if overlay.label)
     alt = f"{shot.caption}; drawn over it: {shown}" if shown else shot.caption
     picture = draw.svg(width, height, body, alt=alt, kind="picture")
@@ -89,13 +88,18 @@ def _marks(overlay: Overlay, name: str, scale: float, grown: float, limit: int) 
     places = (pixels[draw.sampled(len(pixels), limit)] + 0.5) * scale
     size, thin, wide = (grown * value for value in _SHAPES[overlay.kind])
     path = _path(places, overlay.kind, size)
-    layers = "".join(
-        f'<use href="#{name}" stroke="{colour}" stroke-width="{draw.num(width)}"/>'
-        for colour, width in ((_UNDER, wide), (escape(overlay.colour), thin))
-    )
+    layers = _edged(f'<use href="#{name}"', overlay.colour, draw.num(wide), draw.num(thin))
     return (
         f'<defs><path id="{name}" d="{path}"/></defs>'
         f'<g fill="none" stroke-linecap="round">{layers}</g>'
+    )
+
+
+def _edged(shape: str, colour: str, wide: object, thin: object) -> str:
+    """Return a shape, begun as an element, in its colour over a dark and wider one."""
+    return (
+        f'{shape} stroke="{_UNDER}" stroke-width="{wide}"/>'
+        f'{shape} stroke="{escape(colour)}" stroke-width="{thin}"/>'
     )
 
 
@@ -103,12 +107,10 @@ def _path(places: FloatArray, kind: MarkKind, size: float) -> str:
     if kind == "dot":
         return draw.points_path(places)
     s, d = draw.num(size), draw.num(2.0 * size)
+    shape = f"a{s} {s} 0 1 0 {d} 0a{s} {s} 0 1 0 -{d} 0"
     if kind == "cross":
-        shape = (-size, 0.0, f"h{d}m-{s} -{s}v{d}")
-    else:
-        shape = (-size, 0.0, f"a{s} {s} 0 1 0 {d} 0a{s} {s} 0 1 0 -{d} 0")
-    dx, dy, rest = shape
-    return "".join(f"M{draw.num(x + dx)} {draw.num(y + dy)}{rest}" for x, y in places.tolist())
+        shape = f"h{d}m-{s} -{s}v{d}"
+    return "".join(f"M{draw.num(x - size)} {draw.num(y)}{shape}" for x, y in places.tolist())
 
 
 def _legend(points: Sequence[Overlay]) -> str:
@@ -121,10 +123,7 @@ def _legend(points: Sequence[Overlay]) -> str:
 def _key(overlay: Overlay) -> str:
     size, thin, wide = _SHAPES[overlay.kind]
     path = _path(np.array([[9.0, 8.0]]), overlay.kind, size)
-    lines = "".join(
-        f'<path d="{path}" stroke="{colour}" stroke-width="{width}"/>'
-        for colour, width in ((_UNDER, wide), (escape(overlay.colour), thin))
-    )
+    lines = _edged(f'<path d="{path}"', overlay.colour, wide, thin)
     return (
         '<svg class="key square" viewBox="0 0 18 16" fill="none" stroke-linecap="round" '
         f'aria-hidden="true">{lines}</svg>'
@@ -191,12 +190,8 @@ class _Scale:
 def residual_view(found: ResidualMap, names: Sequence[str], *, n_vectors: int = N_VECTORS) -> Raw:
     """Return a map's charts: vectors, coverage, histogram, each with its words.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the views that `found.view_index` counts.
-    n_vectors : int
-        Draw at most so many points; outliers go first, the others are a random choice.
+    `names`: of the views that `found.view_index` counts. At most `n_vectors` points are drawn;
+    outliers go first, the others are a random choice.
     """
     points = _finite(found)
     side = "".join(
@@ -269,7 +264,8 @@ def _histogram(points: ResidualMap) -> tuple[Raw, str]:
     y_axis = draw.Axis(0.0, 1.06 * max(float(counts.max()), bell), _BESIDE.height - 46.0, 8.0)
     body = [
         *_bars(counts, edges, x_axis, y_axis),
-        _bell(dense, curve, x_axis, y_axis),
+        f'<path d="{draw.polyline(x_axis.place(dense), y_axis.place(curve))}" fill="none" '
+        f'stroke="{draw.OUTLIER}" stroke-width="1.8"/>',
         *_histogram_axis(x_axis, y_axis),
     ]
     words = _histogram_text(values, rms)
@@ -279,13 +275,9 @@ def _histogram(points: ResidualMap) -> tuple[Raw, str]:
 
 def _finite(found: ResidualMap) -> ResidualMap:
     fine = np.isfinite(found.pixels).all(axis=1) & np.isfinite(found.residuals).all(axis=1)
-    return replace(
-        found,
-        pixels=found.pixels[fine],
-        residuals=found.residuals[fine],
-        view_index=found.view_index[fine],
-        inliers=found.inliers[fine],
-    )
+    pixels, residuals = found.pixels[fine], found.residuals[fine]
+    view, inliers = found.view_index[fine], found.inliers[fine]
+    return replace(found, pixels=pixels, residuals=residuals, view_index=view, inliers=inliers)
 
 
 def _scale_of(points: ResidualMap) -> _Scale:
@@ -393,13 +385,11 @@ def _vector_text(points: ResidualMap, drawn: int, cut: bool) -> str:
 
 
 def _vector_legend(outliers: bool) -> Raw:
-    shapes = [
-        (
-            f'<path d="M5 9h0" stroke-width="4" stroke-linecap="round" stroke="{draw.ACCENT}"/>'
-            f'<path d="M5 9L25 4" stroke="{draw.ACCENT}" stroke-width="1.4"/>',
-            "dot: measured point; line: its residual (measured minus predicted)",
-        )
-    ]
+    vector = (
+        f'<path d="M5 9h0" stroke-width="4" stroke-linecap="round" stroke="{draw.ACCENT}"/>'
+        f'<path d="M5 9L25 4" stroke="{draw.ACCENT}" stroke-width="1.4"/>'
+    )
+    shapes = [(vector, "dot: measured point; line: its residual (measured minus predicted)")]
     if outliers:
         cross = f'<path d="M9 2l8 8m0 -8l-8 8" stroke="{draw.OUTLIER}" stroke-width="1.7"/>'
         shapes.append((cross, "outlier, not used"))
@@ -446,12 +436,6 @@ def _bars(
     width = float(lefts[1] - lefts[0])
     for left, top in zip(lefts[:-1].tolist(), tops.tolist(), strict=True):
         yield draw.box(left, top, width, y_axis.start - top, fill=draw.BAND, stroke=draw.PAPER)
-
-
-def _bell(x: FloatArray, y: FloatArray, x_axis: draw.Axis, y_axis: draw.Axis) -> str:
-    places = zip(x_axis.place(x).tolist(), y_axis.place(y).tolist(), strict=True)
-    path = "M" + "L".join(f"{draw.num(a)} {draw.num(b)}" for a, b in places)
-    return f'<path d="{path}" fill="none" stroke="{draw.OUTLIER}" stroke-width="1.8"/>'
 
 
 def _histogram_axis(x_axis: draw.Axis, y_axis: draw.Axis) -> Iterator[str]:

@@ -152,25 +152,17 @@ class CalibrationPage:
 
 _DEG = 180.0 / math.pi
 _NAMES = {
-    "lens_x": ("lens x", "mm", 1e3, 3),
-    "lens_y": ("lens y", "mm", 1e3, 3),
-    "lens_z": ("lens z", "mm", 1e3, 3),
-    "rotation_x": ("camera rotation x", "°", _DEG, 3),
-    "rotation_y": ("camera rotation y", "°", _DEG, 3),
-    "rotation_z": ("camera rotation z", "°", _DEG, 3),
+    **{f"lens_{axis}": (f"lens {axis}", "mm", 1e3, 3) for axis in "xyz"},
+    **{f"rotation_{axis}": (f"camera rotation {axis}", "°", _DEG, 3) for axis in "xyz"},
+    **{f"port_tilt_{axis}": (f"tilt of the port about {axis}", "°", _DEG, 3) for axis in "xy"},
+    **{name: (name, "px", 1.0, 2) for name in ("fx", "fy", "cx", "cy")},
     "inner_radius": ("dome inner radius", "mm", 1e3, 3),
     "thickness": ("thickness of the housing", "mm", 1e3, 3),
     "port_distance": ("distance of the port", "mm", 1e3, 3),
-    "port_tilt_x": ("tilt of the port about x", "°", _DEG, 3),
-    "port_tilt_y": ("tilt of the port about y", "°", _DEG, 3),
     "n_port": ("index of the port", "", 1.0, 4),
     "n_air": ("index of the air inside", "", 1.0, 5),
     "n_acrylic": ("index of the dome", "", 1.0, 4),
     "n_water": ("index of the water", "", 1.0, 5),
-    "fx": ("fx", "px", 1.0, 2),
-    "fy": ("fy", "px", 1.0, 2),
-    "cx": ("cx", "px", 1.0, 2),
-    "cy": ("cy", "px", 1.0, 2),
 }
 
 

@@ -46,11 +46,11 @@ def number(value: float | None, digits: int, *, plus: bool = False) -> str:
 
 def view_table(views: Sequence[ViewRow]) -> Raw:
     """Return the views with a bar for the rms of each; in two columns if they are many."""
-    median = _median_rms(views)
+    used = [view.rms_px for view in views if view.used and math.isfinite(view.rms_px)]
+    median = float(np.median(used)) if used else math.nan
     remarks = any(view.remark or not view.used for view in views)
     rows_per_column = 18
-    halves = 2 if len(views) > rows_per_column else 1
-    length = -(-len(views) // halves)
+    length = -(-len(views) // 2) if len(views) > rows_per_column else len(views)
     parts = [
         _view_part(views[start : start + length], median, remarks)
         for start in range(0, len(views), length)
@@ -70,11 +70,11 @@ def parameter_table(rows: Sequence[ParameterRow]) -> Raw:
     changed = any(row.before is not None and math.isfinite(row.before) for row in rows)
     head = ["parameter", "value", "± σ", "unit"]
     head += ["before", "change", "change in σ"] if changed else []
-    cells = []
-    for row in rows:
-        line = [row.name, number(row.value, row.digits), _sigma_text(row), row.unit or DASH]
-        line += _change_cells(row) if changed else []
-        cells.append(line)
+    cells = [
+        [row.name, number(row.value, row.digits), _sigma_text(row), row.unit or DASH]
+        + (_change_cells(row) if changed else [])
+        for row in rows
+    ]
     return table(head, cells)
 
 
@@ -118,26 +118,15 @@ def _marked(text: str, wrong: bool) -> str:
     return Raw(f'<span class="refused">{escape(text)}</span>') if wrong else text
 
 
-def _median_rms(views: Sequence[ViewRow]) -> float:
-    values = [view.rms_px for view in views if view.used and math.isfinite(view.rms_px)]
-    return float(np.median(values)) if values else math.nan
-
-
 def _view_part(views: Sequence[ViewRow], median: float, remarks: bool) -> str:
     head = ["view", "", "rms, px", "points", *(["remark"] if remarks else [])]
     cells = []
     for view in views:
         wrong = not view.used or view.rms_px > _HIGH_RMS * median
         words = "; ".join(filter(None, ("" if view.used else "left out", view.remark)))
-        remark = [_marked(words, wrong)] if remarks else []
-        line = [
-            _marked(view.name, wrong),
-            _rms_bar(view, median, wrong),
-            _marked(number(view.rms_px, 3), wrong),
-            f"{view.n_points:,}",
-            *remark,
-        ]
-        cells.append(line)
+        rms = _rms_bar(view, median, wrong), _marked(number(view.rms_px, 3), wrong)
+        line = [_marked(view.name, wrong), *rms, f"{view.n_points:,}", _marked(words, wrong)]
+        cells.append(line[: len(head)])
     return table(head, cells, tail=int(remarks))
 
 
@@ -174,9 +163,7 @@ def _change_cells(row: ParameterRow) -> list[str]:
     if row.before is None or not math.isfinite(row.before):
         return [DASH, DASH, DASH]
     change = row.value - row.before
-    sigmas = math.nan
-    if row.sigma is not None and row.sigma > 0.0:
-        sigmas = change / row.sigma
+    sigmas = change / row.sigma if row.sigma is not None and row.sigma > 0.0 else math.nan
     moved_sigmas = 3.0
     return [
         number(row.before, row.digits),
@@ -250,22 +237,9 @@ def _expectation_text(rows: Sequence[ExpectedError]) -> str:
 
 
 def write_page(page: CalibrationPage, path: Path) -> Path:
-    """Write the report of a calibration.
+    """Write the report of a calibration to a file, and return its path.
 
-    Parameters
-    ----------
-    path : Path
-        The file to write.
-
-    Returns
-    -------
-    path : Path
-        The page. It carries all it needs and asks no network.
-
-    Raises
-    ------
-    OutputError
-        If the page cannot be written.
+    The page carries all it needs and asks no network. Raises `OutputError` if it cannot be written.
     """
     # Names of files that are no Unicode reach Python as surrogates, which UTF-8 refuses.
     data = page_html(page).encode("utf-8", errors="replace")

@@ -5,7 +5,6 @@ frames without a posture become one `Stretch`, with the commonest reasons in wor
 """
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +21,15 @@ from aqualvs.report.points import (
 )
 from aqualvs.report.run_data import LaserFacts, Track
 from aqualvs.scanning.scan import Label
-from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, laser_colour, reason_text, signed
+from aqualvs.text import (
+    LABEL_COLOURS,
+    LABEL_WORDS,
+    clock,
+    count_text,
+    laser_colour,
+    reason_text,
+    signed,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,17 +51,9 @@ def rounded(values: ArrayLike, digits: int) -> list[Any]:
 
 
 def thin(values: FloatArray, limit: int) -> IntArray:
-    """Return at most `limit` rows of a series, the least and greatest of every bucket.
+    """Return at most `limit` rows of a series (N,), the least and greatest of every bucket.
 
-    Parameters
-    ----------
-    values : array, shape (N,)
-        NaN rows are never chosen.
-
-    Returns
-    -------
-    rows : int array, ascending
-        All finite rows if they are few enough.
+    They ascend; rows that are NaN are never chosen, all others if they are few enough.
     """
     finite = np.flatnonzero(np.isfinite(values))
     if len(finite) <= limit:
@@ -95,15 +94,7 @@ def stretches(track: Track) -> list[Stretch]:
 
 
 def merge_stretches(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:
-    """Return stretches joined across gaps too narrow to see, so that about `columns` remain.
-
-    Parameters
-    ----------
-    found : list of Stretch
-        In order.
-    columns : int
-        A gap is too narrow below this fraction of the dive: a column of the screen.
-    """
+    """Return stretches joined across gaps too narrow to see: below a column of the screen."""
     least = float(track.time_s[-1] - track.time_s[0]) / columns
     joined: list[Stretch] = []
     for stretch in found:
@@ -139,13 +130,6 @@ def stretch_span_s(stretch: Stretch, track: Track) -> tuple[float, float]:
     return float(track.time_s[stretch.first]), float(track.time_s[after])
 
 
-def hover_places(start: float, end: float, whole: float) -> Iterator[float]:
-    """Yield places along a stretch, close enough for a pointer to hit one: 300 to a full width."""
-    steps = max(1, int(300 * (end - start) / whole)) if whole > 0.0 else 1
-    for i in range(steps + 1):
-        yield start + (end - start) * i / steps
-
-
 _PER_LINE = 2000
 _QUANTITIES = (("range", "mm", 1e3, 2, 4.0), ("pitch", "°", 1.0, 3, 0.5), ("yaw", "°", 1.0, 3, 0.5))
 _SYMBOLS = (
@@ -158,25 +142,14 @@ Json = dict[str, Any]
 
 def posture_chart(track: Track, truth: FloatArray | None) -> Json:
     """Return range, pitch and yaw over time with their sigma, truth and the gaps."""
-    scale, unit = time_unit(track)
     columns = 1000
     found = merge_stretches(stretches(track), track, columns)
-    return {
-        "time_unit": unit,
-        "measured": "measured",
-        "strips": [_strip(track, track.posture, truth, column, scale) for column in range(3)],
-        "span": rounded([track.time_s[0] * scale, track.time_s[-1] * scale], 4),
-        "stretches": [_stretch(stretch, track, scale) for stretch in found],
-    }
+    return _strip_chart(track, track.posture, truth, found)
 
 
 def error_chart(track: Track, truth: FloatArray) -> Json:
     """Return the error of range, pitch and yaw over time, to compare with the stated sigma."""
-    scale, unit = time_unit(track)
-    error = track.posture - truth
-    strips = [_strip(track, error, None, column, scale, is_error=True) for column in range(3)]
-    span = rounded([track.time_s[0] * scale, track.time_s[-1] * scale], 4)
-    return {"time_unit": unit, "measured": "error", "strips": strips, "span": span, "stretches": []}
+    return _strip_chart(track, track.posture - truth, None, [], is_error=True)
 
 
 def plane_charts(
@@ -211,13 +184,12 @@ def quality_charts(points: PointSummary, track: Track, n_lasers: int) -> Json:
     """Return points per frame and laser and the residuals over time, and the histograms."""
     scale, unit = time_unit(track)
     time = track.time_s * scale
-    counts = [points.on_target[:, index].astype(np.float64) for index in range(n_lasers)]
-    rms, sigma = points.rms_mm(), 1e3 * track.sigma[:, 0]
+    counts = points.on_target[:, :n_lasers].T.astype(np.float64)
     return {
         "time_unit": unit,
-        "counts": [_line(time, values, thin(values, _PER_LINE), 0) for values in counts],
-        "rms": _line(time, rms, thin(rms, _PER_LINE), 3),
-        "sigma": _line(time, sigma, thin(sigma, _PER_LINE), 3),
+        "counts": [_line(time, values, 0) for values in counts],
+        "rms": _line(time, points.rms_mm(), 3),
+        "sigma": _line(time, 1e3 * track.sigma[:, 0], 3),
         "residual": _residual_histogram(points.residual[:n_lasers]),
         "quality": _histogram(points.quality[:n_lasers], QUALITY_EDGES),
     }
@@ -229,11 +201,8 @@ def bare_chart(track: Track, bare: FloatArray, truth: FloatArray | None) -> Json
     lines = {"dome": track.posture[:, 0], "bare": bare[:, 0]}
     if truth is not None:
         lines["truth"] = truth[:, 0]
-    drawn = {
-        name: _line(track.time_s * scale, 1e3 * values, thin(values, _PER_LINE), 2)
-        for name, values in lines.items()
-    }
-    return {"time_unit": unit, **drawn}
+    time = track.time_s * scale
+    return {"time_unit": unit, **{name: _line(time, 1e3 * one, 2) for name, one in lines.items()}}
 
 
 def laser_list(names: list[str]) -> list[Json]:
@@ -269,14 +238,31 @@ def _plus_minus(sigma: float, digits: int) -> str:
     return f" ± {sigma:.{digits}f}" if np.isfinite(sigma) else ""
 
 
+def _strip_chart(
+    track: Track,
+    posture: FloatArray,
+    truth: FloatArray | None,
+    gaps: list[Stretch],
+    *,
+    is_error: bool = False,
+) -> Json:
+    scale, unit = time_unit(track)
+    return {
+        "time_unit": unit,
+        "measured": "error" if is_error else "measured",
+        "strips": [_strip(track, posture, truth, i, scale, is_error) for i in range(3)],
+        "span": rounded([track.time_s[0] * scale, track.time_s[-1] * scale], 4),
+        "stretches": [_stretch(stretch, track, scale) for stretch in gaps],
+    }
+
+
 def _strip(
     track: Track,
     posture: FloatArray,
     truth: FloatArray | None,
     column: int,
     scale: float,
-    *,
-    is_error: bool = False,
+    is_error: bool,
 ) -> Json:
     name, unit, factor, digits, least = _QUANTITIES[column]
     values, sigma = factor * posture[:, column], factor * track.sigma[:, column]
@@ -295,7 +281,7 @@ def _strip(
     }
     true = None if truth is None else factor * truth[:, column]
     if true is not None:
-        strip["truth"] = _line(track.time_s * scale, true, thin(true, _PER_LINE), digits)
+        strip["truth"] = _line(track.time_s * scale, true, digits)
     # Sigmas of errors are drawn about zero.
     strip["axis"] = _strip_axis(values, total, np.zeros(1) if is_error else true, least)
     return strip
@@ -316,7 +302,8 @@ def _strip_axis(
     return [round(low - pad, 4), round(high + pad, 4)]
 
 
-def _line(time: FloatArray, values: FloatArray, rows: IntArray, digits: int) -> Json:
+def _line(time: FloatArray, values: FloatArray, digits: int) -> Json:
+    rows = thin(values, _PER_LINE)
     return {
         "x": rounded(time[rows], 4),
         "y": rounded(values[rows], digits),
@@ -326,14 +313,15 @@ def _line(time: FloatArray, values: FloatArray, rows: IntArray, digits: int) -> 
 
 def _stretch(stretch: Stretch, track: Track, scale: float) -> Json:
     start, end = stretch_span_s(stretch, track)
-    rows = slice(stretch.first, stretch.last + 1)
-    refused = int((~track.valid[rows]).sum())
-    count = f"{refused} frame{'s' if refused > 1 else ''}"
+    count = count_text(int((~track.valid[stretch.first : stretch.last + 1]).sum()), "frame")
     whole = float(track.time_s[-1] - track.time_s[0])
+    # Close enough for a pointer to hit one: 300 to a full width.
+    steps = max(1, int(300 * (end - start) / whole)) if whole > 0.0 else 1
+    hover = [(start + (end - start) * i / steps) * scale for i in range(steps + 1)]
     return {
         "from": round(start * scale, 4),
         "to": round(end * scale, 4),
-        "hover": rounded([t * scale for t in hover_places(start, end, whole)], 4),
+        "hover": rounded(hover, 4),
         "words": f"{stretch_text(stretch, track)} – {count} from {clock(start)}",
     }
 

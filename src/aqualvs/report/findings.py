@@ -16,17 +16,16 @@ from aqualvs.text import clock, count_text, sentence, signed
 
 def headline(track: Track) -> list[Card]:
     """Return the numbers at the top of the report."""
-    share = float(track.valid.mean())
-    valid = f"{int(track.valid.sum())} of {count_text(len(track), 'frame')}"
-    seconds, rate = float(track.time_s[-1] - track.time_s[0]), count_text(len(track), "frame")
-    if len(track) > 1 and seconds > 0.0:
-        rate += f", {(len(track) - 1) / seconds:.3g} per second"
+    share, frames = float(track.valid.mean()), count_text(len(track), "frame")
+    valid = f"{int(track.valid.sum())} of {frames}"
+    seconds = float(track.time_s[-1] - track.time_s[0])
+    rate = f", {(len(track) - 1) / seconds:.3g} per second" if seconds > 0.0 else ""
     cards = [
         _posture_card("Range", "mm", 0, track, scale=1e3, digits=1),
         _posture_card("Pitch", "°", 1, track, scale=1.0, digits=2),
         _posture_card("Yaw", "°", 2, track, scale=1.0, digits=2),
         Card("Frames with a posture", f"{100 * share:.1f} %", valid),
-        Card("Duration", clock(seconds), rate),
+        Card("Duration", clock(seconds), frames + rate),
     ]
     water = track.n_water[np.isfinite(track.n_water)]
     if len(water):
@@ -79,13 +78,9 @@ def _posture_card(
     values = scale * track.posture[track.valid, column]
     if not len(values):
         return Card(name, "–", "no frame gave a posture")
-    sign = "" if column == 0 else "+"
-    gap = " " if column == 0 else ""
+    sign, gap = ("", " ") if column == 0 else ("+", "")
     note = f"{values.min():{sign}.{digits}f} to {values.max():{sign}.{digits}f}{gap}{unit}"
-    sigmas = (
-        scale * track.sigma[track.valid, column],
-        scale * track.sigma_total[track.valid, column],
-    )
+    sigmas = (scale * all_[track.valid, column] for all_ in (track.sigma, track.sigma_total))
     frame, total = (sigma[np.isfinite(sigma)] for sigma in sigmas)
     if len(frame):
         note += f"; σ typically {np.median(frame):.{digits}f}{gap}{unit} by the frame's noise, "
@@ -125,13 +120,10 @@ def _summary_text(run: Mapping[str, Any], name: str) -> Iterator[str]:
 
 
 def _gap_warnings(track: Track) -> Iterator[str]:
-    spans = [(stretch_span_s(found, track), found) for found in stretches(track)]
-    long_gap_s = 2.0
-    long = [
-        (end - start, start, found) for (start, end), found in spans if end - start > long_gap_s
-    ]
+    spans = [(*stretch_span_s(found, track), found) for found in stretches(track)]
+    long_gap_s, max_gaps = 2.0, 3
+    long = [(end - start, start, found) for start, end, found in spans if end - start > long_gap_s]
     long.sort(key=lambda gap: -gap[0])
-    max_gaps = 3
     for length, start, found in long[:max_gaps]:
         words = stretch_text(found, track)
         yield f"No posture for {clock(length)} from {clock(start)} on: {words}."

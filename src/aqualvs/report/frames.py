@@ -36,10 +36,8 @@ N_SAMPLES = 24
 _BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
 # Colour at full resolution, else the lasers' colours bleed into the green stripes below.
 _JPEG = (
-    cv2.IMWRITE_JPEG_QUALITY,
-    80,
-    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    *(cv2.IMWRITE_JPEG_QUALITY, 80),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
 )
 _HOLE_COLOUR = bgr("#ffb347")
 
@@ -68,11 +66,12 @@ def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
     be decoded with all frames from there on.
     """
     chosen = _refused_rows(track)
+    spread = np.arange(len(track))
     valid = np.flatnonzero(track.valid)
     if len(valid):
         relative = track.sigma[valid, 0] / track.posture[valid, 0]
         chosen.append(int(valid[np.nan_to_num(relative).argmax()]))
-    spread = valid if len(valid) else np.arange(len(track))
+        spread = valid
     special = set(chosen)
     while len(set(chosen)) < min(N_PICTURES, len(set(chosen) | set(spread.tolist()))):
         chosen.append(_farthest(spread, chosen))
@@ -115,9 +114,8 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
     scale = min(1.0, width_px / image.shape[1])
     small = image
     if scale < 1.0:
-        small = np.asarray(
-            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
-        )
+        resized = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = np.asarray(resized, np.uint8)
     if points is not None:
         pixels = (points.pixels + 0.5) * scale - 0.5
         small = draw_points(small, points.laser, pixels, points.used)
@@ -125,21 +123,12 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
 
 
 def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -> SampleFrame:
-    """Cut the surroundings of a place out of a picture, with a ring around the place.
+    """Cut the surroundings of a place out of a BGR picture, with a ring around the place.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width, 3)
-        BGR.
-    middle : (float, float)
-        Column and row.
-    diameter : float
-        Of the ring, in pixels.
+    `middle`: its column and row. `diameter`: of the ring, in pixels.
     """
     # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
-    px = 160
-    shown_px = 320
-    diameters = 2.5
+    px, shown_px, diameters = 160, 320, 2.5
     height, width = map(int, image.shape[:2])
     side = min(round(max(diameters * diameter, px)), width, height)
     left, top = (

@@ -28,10 +28,8 @@ def _templates() -> "Environment":
     templates = Environment(
         loader=FunctionLoader(asset), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    templates.globals["asset"] = lambda name: Raw(asset(name))
-    templates.globals["packed"] = packed
-    templates.globals["contents_of"] = contents_of
-    templates.globals["laser_legend"] = laser_legend
+    known = {"packed": packed, "contents_of": contents_of, "laser_legend": laser_legend}
+    templates.globals |= {"asset": lambda name: Raw(asset(name)), **known}
     return templates
 
 
@@ -60,15 +58,7 @@ def contents_of(body: str) -> "Raw":
 
 
 def page(template: str, content: Mapping[str, object]) -> str:
-    """Fill a template.
-
-    Parameters
-    ----------
-    template : str
-        Name of a file in `assets`.
-    content : mapping
-        What the template takes, by name; texts are escaped unless they are `Raw`.
-    """
+    """Fill a template of `assets` with content by name; texts are escaped unless they are `Raw`."""
     return _templates().get_template(template).render(content)
 
 
@@ -124,17 +114,12 @@ def table(
     """
     kinds = ["" if i < texts or i >= len(head) - tail else ' class="n"' for i in range(len(head))]
     top = "".join(f"<th{kind}>{escape(cell)}</th>" for kind, cell in zip(kinds, head, strict=True))
-    body = "".join(
-        "<tr>"
-        + "".join(f"<td{kind}>{_cell(cell)}</td>" for kind, cell in zip(kinds, row, strict=True))
-        + "</tr>\n"
-        for row in rows
-    )
+    body = ""
+    for row in rows:
+        cells = [cell if isinstance(cell, Raw) else escape(cell) for cell in row]
+        line = (f"<td{kind}>{cell}</td>" for kind, cell in zip(kinds, cells, strict=True))
+        body += f"<tr>{''.join(line)}</tr>\n"
     return Raw(f'<div class="scroll"><table><thead><tr>{top}</tr></thead>\n{body}</table></div>')
-
-
-def _cell(cell: str) -> str:
-    return cell if isinstance(cell, Raw) else escape(cell)
 
 
 def folded(content: "Raw", n_rows: int, name: str, *, longest: int) -> "Raw":

@@ -5,6 +5,7 @@ Loizou, Robotics 2021, 10, 126): what a laser lit in one frame (13), what each m
 it (14), and the laser-plane image (Eq. 41-42) with the structuring elements (9) to scale.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from aqualvs.report.figure_style import BLUE, DARK, GREY, PINK, STYLE, new_canva
 from aqualvs.report.run_data import LaserFacts, lasers_of, mapping, read_run_file, working_range_m
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POINTS_PARQUET, check_run_files
+from aqualvs.results.points import stored_batches
 from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.paper.detector import PaperFilter
 from aqualvs.scanning.paper.mesh_filter import (
@@ -42,23 +44,6 @@ from aqualvs.terminal import Echo
 
 _ZONE = "#e8f3ea"
 
-
-class _PictureOptions(NamedTuple):
-    """Parts of the points that are drawn."""
-
-    detail: tuple[float, float] = (150.0, 75.0)  # Width and height of a detail, in mm.
-    # Stragglers beyond these quantiles do not set the scale of a picture.
-    stragglers: float = 0.005
-    batch: int = 1 << 16
-    # Frames have numbers of 32 bits, lasers of 8.
-    lasers: int = 1 << 8
-    # So many of the fullest frames and lasers are looked at; pieces of net are this far apart, in
-    # m.
-    candidates: int = 16
-    strand_gap: float = 4e-3
-
-
-_PICTURE = _PictureOptions()
 
 _RINGS = {"A": "#d55e00", "B": "#009e73", "C": "#7b3fb5"}
 _NAMES = ("adaptive filter", "paper's filter")
@@ -96,7 +81,7 @@ def draw_figures(reflections: Reflections, options: MeshFilterOptions) -> dict[s
     """Return the same pictures by name, not yet written."""
     with rc_context(STYLE):
         return {
-            "figure_13": _all_reflections(reflections, options),
+            "figure_13": _all_reflections(reflections),
             "figure_14": _filtered(reflections, options),
             "laser_plane_image": _binary_image(reflections, options),
         }
@@ -106,7 +91,7 @@ def _dots(axes: Axes, xy: FloatArray, size: float, colour: str, label: str = "")
     axes.scatter(xy[:, 0], xy[:, 1], s=size, color=colour, linewidths=0, label=label, zorder=3)
 
 
-def _all_reflections(r: Reflections, _: MeshFilterOptions) -> Figure:
+def _all_reflections(r: Reflections) -> Figure:
     """Draw figure 13: all points that the laser lit, and the zone in which they are accepted."""
     xy = 1e3 * r.in_laser
     low, high = _span(xy, 0.08)
@@ -137,10 +122,11 @@ def _filtered(r: Reflections, options: MeshFilterOptions) -> Figure:
     width, height = (high - low).tolist()
     spare = max(0.55 * width - 1.14 * height, 0.0)
     low[1], high[1] = low[1] - 0.5 * spare, high[1] + 0.14 * height + 0.5 * spare
-    shape = min((high[1] - low[1]) / width, 1.3)
-    figure = new_canvas(7.2, 3.3 * (shape + _PICTURE.detail[1] / _PICTURE.detail[0]) + 1.5)
-    grid = figure.subplots(2, 2, height_ratios=[shape, _PICTURE.detail[1] / _PICTURE.detail[0]])
-    view = _detail(1e3 * r.in_laser[r.adaptive | r.paper], xy)
+    size = np.array([150.0, 75.0])  # Of a detail, in mm.
+    shapes = [min((high[1] - low[1]) / width, 1.3), size[1] / size[0]]
+    figure = new_canvas(7.2, 3.3 * sum(shapes) + 1.5)
+    grid = figure.subplots(2, 2, height_ratios=shapes)
+    view = _detail(1e3 * r.in_laser[r.adaptive | r.paper], xy, 0.5 * size)
     for column, (name, net) in enumerate(zip(_NAMES, (r.adaptive, r.paper), strict=True)):
         kept = 1e3 * r.in_laser[net & r.usable]
         axes = grid[0, column]
@@ -195,15 +181,8 @@ def _cells(
 ) -> None:
     """Draw the lit cells around a place to scale."""
     extent = (corner[0], corner[0] + dd * lit.shape[0], corner[1], corner[1] + dd * lit.shape[1])
-    axes.imshow(
-        lit.T,
-        origin="lower",
-        extent=extent,
-        cmap=ListedColormap(["white", DARK]),
-        vmin=0,
-        vmax=1,
-        interpolation="nearest",
-    )
+    two = ListedColormap(["white", DARK])
+    axes.imshow(lit.T, two, vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
     _plane_axes(axes, middle - reach, middle + reach)
 
 
@@ -218,16 +197,9 @@ def _rings(
     near = np.all((offset >= 0) & (offset <= 2 * options.padding), axis=1)
     for (name, radius), element in zip(outer.items(), structuring_elements(options), strict=True):
         count = int(np.count_nonzero(element[offset[near, 0], offset[near, 1]]))
-        axes.add_patch(
-            Circle(
-                (float(middle[0]), float(middle[1])),
-                radius,
-                fill=False,
-                edgecolor=_RINGS[name],
-                linewidth=1.2,
-                label=f"{name}: to {radius:.3g} mm, {count} cells lit",
-            )
-        )
+        ring = Circle((float(middle[0]), float(middle[1])), radius, fill=False, linewidth=1.2)
+        ring.set(edgecolor=_RINGS[name], label=f"{name}: to {radius:.3g} mm, {count} cells lit")
+        axes.add_patch(ring)
     dg = options.dg_theta
     axes.set_title(
         f"(b) regions around a cell; it is kept if A holds\n{-(-dg // 2)} to {dg} lit cells, "
@@ -238,14 +210,11 @@ def _rings(
 
 def _typical(r: Reflections, corner: FloatArray, dd: float) -> FloatArray:
     """Return the centre (mm) of a lit cell amid the net, if possible one that the paper keeps."""
-    for wanted in (r.paper & r.usable, r.adaptive & r.usable, r.usable):
-        if wanted.any():
-            xy = 1e3 * r.in_laser[wanted]
-            # Light in the middle of its strand: near the median of what is nearest to the middle.
-            nearest = xy[np.argmin(np.linalg.norm(xy - np.median(xy, axis=0), axis=1))]
-            strand = xy[np.linalg.norm(xy - nearest, axis=1) < 5.0]
-            place: FloatArray = np.median(strand, axis=0)
-            break
+    tried = (r.paper & r.usable, r.adaptive & r.usable, r.usable)
+    xy = 1e3 * r.in_laser[next(wanted for wanted in tried if wanted.any())]
+    # Light in the middle of its strand: near the median of what is nearest to the middle.
+    nearest = xy[np.argmin(np.linalg.norm(xy - np.median(xy, axis=0), axis=1))]
+    place: FloatArray = np.median(xy[np.linalg.norm(xy - nearest, axis=1) < 5.0], axis=0)
     return corner + dd * (np.floor((place - corner) / dd) + 0.5)
 
 
@@ -274,16 +243,15 @@ def _span(xy: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
     """Return the corners of a box around nearly all points, with a margin; 1 m² without any."""
     if not len(xy):
         return np.array([-500.0, 0.0]), np.array([500.0, 1000.0])
-    low = np.quantile(xy, _PICTURE.stragglers, axis=0)
-    high = np.quantile(xy, 1.0 - _PICTURE.stragglers, axis=0)
+    # Stragglers beyond these quantiles do not set the scale of a picture.
+    low, high = np.quantile(xy, [0.005, 0.995], axis=0)
     extra = margin * np.maximum(high - low, 50.0)
     return low - extra, high + extra
 
 
-def _detail(net: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the window that shows most of the net, wide enough for several meshes."""
+def _detail(net: FloatArray, others: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the window of half a size (2,) that shows most of the net."""
     xy = net if len(net) else others
-    half = 0.5 * np.array(_PICTURE.detail)
     if not len(xy):
         return -half, half
     inside = [np.count_nonzero(np.all(np.abs(xy - at) < half, axis=1)) for at in xy]
@@ -293,25 +261,21 @@ def _detail(net: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _box(low: FloatArray, high: FloatArray) -> Any:
     width, height = (high - low).tolist()
-    return Rectangle(
-        (float(low[0]), float(low[1])), width, height, fill=False, edgecolor=DARK, linewidth=0.8
-    )
+    corner = (float(low[0]), float(low[1]))
+    return Rectangle(corner, width, height, fill=False, edgecolor=DARK, linewidth=0.8)
 
 
-_NET = Label.NET.name.lower()
-_COLUMNS = ("x_m", "y_m", "z_m", "label")
-_PIXEL_COLUMNS = ("u_px", "v_px", "width_px", "label")
+_COLUMNS = ["x_m", "y_m", "z_m", "label"]
+_PIXEL_COLUMNS = ["u_px", "v_px", "width_px", "label"]
 
 
 class _Counts(NamedTuple):
-    """Reflections of every frame and laser that has any, K of them."""
+    """Reflections of every frame and laser that has any, shape (K,) each."""
 
-    # Shape (K,).
     frame: IntArray
     laser: IntArray
-    # Shape (K,): labelled net, and anything else.
     n_net: IntArray
-    n_other: IntArray
+    n_all: IntArray
 
 
 def figures(
@@ -382,30 +346,22 @@ def _paper_options(folder: Path, run: Mapping[str, Any], target: Path | None) ->
 
 def _count(points: Path) -> _Counts:
     """Count net and other reflections, batch by batch, so that memory stays flat."""
-    totals: dict[int, list[int]] = {}
-    with parquet.ParquetFile(points.absolute()) as file:
-        for batch in file.iter_batches(
-            batch_size=_PICTURE.batch, columns=["frame", "laser", "label"]
-        ):
-            key = (
-                batch["frame"].to_numpy().astype(np.int64) * _PICTURE.lasers
-                + batch["laser"].to_numpy()
-            )
-            is_net = _is_net(batch["label"])
-            keys, place = np.unique(key, return_inverse=True)
-            net = np.bincount(place, is_net, len(keys)).astype(np.int64)
-            both = np.bincount(place, minlength=len(keys))
-            for k, n, m in zip(keys.tolist(), net.tolist(), both.tolist(), strict=True):
-                total = totals.setdefault(k, [0, 0])
-                total[0] += n
-                total[1] += m - n
-    keys = np.array([*totals], dtype=np.int64)
-    counts = np.array([*totals.values()], dtype=np.int64).reshape(-1, 2)
-    return _Counts(keys // _PICTURE.lasers, keys % _PICTURE.lasers, counts[:, 0], counts[:, 1])
+    # Frames have numbers of 32 bits, lasers of 8.
+    lasers = 1 << 8
+    n_net, n_all = Counter[int](), Counter[int]()
+    for batch in stored_batches(points, 1 << 16, ("frame", "laser", "label")):
+        frame = batch["frame"].to_numpy().astype(np.int64)
+        keys = frame * lasers + batch["laser"].to_numpy()
+        n_net.update(keys[_is_net(batch["label"])].tolist())
+        n_all.update(keys.tolist())
+    keys = np.array([*n_all], np.int64)
+    counts = (np.array([n[key] for key in n_all], np.int64) for n in (n_net, n_all))
+    return _Counts(keys // lasers, keys % lasers, *counts)
 
 
-def _is_net(label: Any) -> Any:
-    return np.array([name == _NET for name in label.to_pylist()], np.bool_)
+def _is_net(label: Any) -> BoolArray:
+    net = Label.NET.name.lower()
+    return np.array([name == net for name in label.to_pylist()], np.bool_)
 
 
 def _candidates(
@@ -424,10 +380,11 @@ def _candidates(
         raise OptionError(f"{' '.join(wanted) or points}: no point there; choose another")
     rows = np.flatnonzero(asked)
     # What shows only one of both shows nothing; of equals the fullest.
-    worth = np.minimum(counts.n_net[rows], counts.n_other[rows])
-    best = rows[np.lexsort((counts.n_net[rows] + counts.n_other[rows], worth))[::-1]]
-    found = [(int(counts.frame[row]), int(counts.laser[row])) for row in best]
-    return found[: _PICTURE.candidates]
+    worth = np.minimum(counts.n_net, counts.n_all - counts.n_net)[rows]
+    best = rows[np.lexsort((counts.n_all[rows], worth))[::-1]]
+    # So many of the fullest are looked at.
+    candidates = 16
+    return [(int(counts.frame[row]), int(counts.laser[row])) for row in best[:candidates]]
 
 
 def _worth(r: Reflections) -> float:
@@ -436,16 +393,9 @@ def _worth(r: Reflections) -> float:
     A stripe along one strand shows no mesh, however long it is.
     """
     x = np.sort(r.in_laser[r.adaptive & r.usable, 0])
-    pieces = np.count_nonzero(np.diff(x) > _PICTURE.strand_gap)
+    strand_gap = 4e-3  # Distance of pieces of net, in metres.
+    pieces = np.count_nonzero(np.diff(x) > strand_gap)
     return float(pieces * np.sqrt(1.0 + np.count_nonzero(r.usable & ~r.adaptive)))
-
-
-class _FilteredPoints(NamedTuple):
-    """Points of one laser in `dome`, shape (N, 3), and which of them each filter takes for net."""
-
-    in_dome: FloatArray
-    adaptive: BoolArray
-    paper: BoolArray
 
 
 def _read(
@@ -461,41 +411,42 @@ def _read(
     every_pixel = detector.get("kind") == "threshold"
     table = parquet.read_table(
         points.absolute(),
-        columns=list(_PIXEL_COLUMNS if every_pixel else _COLUMNS),
+        columns=_PIXEL_COLUMNS if every_pixel else _COLUMNS,
         filters=[("frame", "==", chosen[0]), ("laser", "==", chosen[1])],
     )
     if every_pixel:
-        filtered = _pixels(table, chosen[1], run, options)
+        in_dome, adaptive, paper = _pixels(table, chosen[1], run, options)
     else:
         in_dome = _columns(table, "x_m", "y_m", "z_m")
-        kept = mesh_filter(in_dome, plane, options, working_range=(near, far))
-        filtered = _FilteredPoints(in_dome, _is_net(table["label"]), kept)
-    distance = np.linalg.norm(filtered.in_dome, axis=1)
+        adaptive = _is_net(table["label"])
+        paper = mesh_filter(in_dome, plane, options, working_range=(near, far))
+    distance = np.linalg.norm(in_dome, axis=1)
     return Reflections(
         frame=chosen[0],
         laser=laser.name,
-        in_laser=np.ascontiguousarray(laser_frame(plane).apply(filtered.in_dome)[:, :2]),
+        in_laser=np.ascontiguousarray(laser_frame(plane).apply(in_dome)[:, :2]),
         offset=laser.offset,
         working_range=(near, far),
         usable=(distance >= near) & (distance <= far),
-        adaptive=filtered.adaptive,
-        paper=filtered.paper,
+        adaptive=adaptive,
+        paper=paper,
         every_pixel=every_pixel,
     )
 
 
 def _pixels(
     table: Any, laser: int, run: Mapping[str, Any], options: MeshFilterOptions
-) -> _FilteredPoints:
-    """Return every bright pixel of a run with the threshold detector."""
+) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Return the bright pixels of a run with the threshold detector.
+
+    Return them in `dome`, shape (N, 3), and which of them each filter takes for net.
+    """
     rig = rig_from_mapping(run["rig"], source_name="run.yaml")
     camera = rig.camera()
     papers = PaperFilter(rig, camera, plan_bands(rig, camera), options, every_pixel=True)
     centres, width = _columns(table, "u_px", "v_px"), _columns(table, "width_px")[:, 0]
     found = papers.apply(centres, width, np.full(len(width), laser))
-    return _FilteredPoints(
-        found.points_in_dome, _is_net(table["label"])[found.source], found.on_mesh
-    )
+    return found.points_in_dome, _is_net(table["label"])[found.source], found.on_mesh
 
 
 def _columns(table: Any, *names: str) -> FloatArray:

@@ -13,7 +13,7 @@ from aqualvs.report.html import Card, Raw, data_url, folded, table, text
 from aqualvs.report.run_data import mapping
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
-from aqualvs.text import clock, signed
+from aqualvs.text import clock, count_text, signed
 
 _LONG_TABLE = 12
 _NONE = "–"
@@ -76,11 +76,10 @@ def net_cards(net: NetTables | None) -> list[Card]:
     """Return the card of the headline; none without a net."""
     if net is None or not net.stretches:
         return []
-    n = len(net.holes)
-    value = "no holes" if not n else "1 hole" if n == 1 else f"{n} holes"
+    n, words = len(net.holes), []
+    value = count_text(n, "hole") if n else "no holes"
     if not net.holes_known:
         value = "holes not known"
-    words = []
     largest = max((_number(row, "diameter_mm") or 0.0 for row in net.holes), default=0.0)
     if largest:
         words.append(f"up to {largest:.0f} mm")
@@ -115,10 +114,7 @@ def hole_pictures(net: NetTables) -> list[HolePicture]:
 
 
 def net_view(net: NetTables | None, crops: Mapping[str, SampleFrame] = MappingProxyType({})) -> str:
-    """Return the section on the net; nothing without one.
-
-    `crops`: number of a hole to its picture.
-    """
+    """Return the section on the net, with pictures by the numbers of holes; nothing without one."""
     if net is None:
         return ""
     head = '<section id="net"><h2>Net</h2>\n'
@@ -131,13 +127,13 @@ def net_view(net: NetTables | None, crops: Mapping[str, SampleFrame] = MappingPr
 
 def _lead(net: NetTables) -> str:
     facts, words = net.summary, []
-    if isinstance(facts.get("bar_mm"), int | float):
-        mesh = str(facts.get("mesh")).capitalize()
-        words.append(f"{mesh} meshes of {facts['bar_mm']:.1f} mm bar")
-    if isinstance(facts.get("twine_mm"), int | float):
-        words.append(f"twine {facts['twine_mm']:.1f} mm")
-    if isinstance(facts.get("area_m2"), int | float):
-        words.append(f"{facts['area_m2']:.2f} m² searched for holes")
+    bar, twine, area = (facts.get(name) for name in ("bar_mm", "twine_mm", "area_m2"))
+    if isinstance(bar, int | float):
+        words.append(f"{str(facts.get('mesh')).capitalize()} meshes of {bar:.1f} mm bar")
+    if isinstance(twine, int | float):
+        words.append(f"twine {twine:.1f} mm")
+    if isinstance(area, int | float):
+        words.append(f"{area:.2f} m² searched for holes")
     said = f"{text(', '.join(words))}. " if words else ""
     return (
         f'<p class="lead">{said}Solidity is the share of the net’s area covered by strands and '
@@ -164,14 +160,10 @@ def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
     )
     rows = [
         (
-            _cell(row, "hole"),
-            Raw(f"{_cell(row, 'diameter_mm', 0)} ± {_cell(row, 'sigma_diameter_mm', 0)}"),
+            *(_cell(row, "hole"), Raw(_diameter(row))),
             f"{_cell(row, 'width_mm', 0)} × {_cell(row, 'height_mm', 0)}",
-            _cell(row, "missing_meshes", 0),
-            *_place(row),
-            _cell(row, "heading_deg", 0),
-            _time(row, "time_s"),
-            _cell(row, "frame"),
+            *(_cell(row, "missing_meshes", 0), *_place(row), _cell(row, "heading_deg", 0)),
+            *(_time(row, "time_s"), _cell(row, "frame")),
         )
         for row in net.holes
     ]
@@ -184,7 +176,6 @@ def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
 def _crop(row: Row, picture: SampleFrame) -> str:
     """Return the picture of a hole and the way back to it."""
     name = f"Hole {row['hole']}"
-    size = f"{_cell(row, 'diameter_mm', 0)} ± {_cell(row, 'sigma_diameter_mm', 0)} mm"
     values = (
         ("depth {} m", _cell(row, "depth_m", 2)),
         ("heading {}°", _cell(row, "heading_deg", 0)),
@@ -195,8 +186,12 @@ def _crop(row: Row, picture: SampleFrame) -> str:
     way = ", ".join(words.format(value) for words, value in values if value != _NONE)
     return (
         f"<figure>{picture.tag(f'{name} with its surroundings')}"
-        f"<figcaption><b>{text(name)}: {size}</b><br>{way}</figcaption></figure>"
+        f"<figcaption><b>{text(name)}: {_diameter(row)} mm</b><br>{way}</figcaption></figure>"
     )
+
+
+def _diameter(row: Row) -> str:
+    return f"{_cell(row, 'diameter_mm', 0)} ± {_cell(row, 'sigma_diameter_mm', 0)}"
 
 
 _PLACE_HEAD = ("along, m", "depth, m", "bearing, °")
@@ -209,14 +204,9 @@ def _stretches(net: NetTables) -> str:
     )
     rows = [
         (
-            _cell(row, "stretch"),
-            _time(row, "begin_s"),
-            _time(row, "end_s"),
-            *_place(row),
-            _cell(row, "range_m", 0, scale=1e3),
-            _with_sigma(row, "bar_mm", 1),
-            _with_sigma(row, "twine_mm", 1),
-            _with_sigma(row, "solidity", 2),
+            *(_cell(row, "stretch"), _time(row, "begin_s"), _time(row, "end_s"), *_place(row)),
+            *(_cell(row, "range_m", 0, scale=1e3), _with_sigma(row, "bar_mm", 1)),
+            *(_with_sigma(row, "twine_mm", 1), _with_sigma(row, "solidity", 2)),
             _cell(row, "fouling", 2, sign="+"),
         )
         for row in net.stretches

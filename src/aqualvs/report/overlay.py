@@ -1,6 +1,7 @@
 """Overlay of stripe points and posture on a picture, and the video of such pictures."""
 
 import math
+import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -30,19 +31,8 @@ def draw_overlay(
 ) -> ImagePlane:
     """Draw the stripe points, the posture with its sigma or the refusal, and the lasers' names.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width, 3)
-        BGR; left as it is.
-    points : ScanPoints
-        Target points are drawn full in their laser's colour, all others as faint crosses.
-    rig : Rig
-        Gives the lasers' names.
-
-    Returns
-    -------
-    image : uint8 array, shape (height, width, 3)
-        A new picture, BGR.
+    Target points are drawn full in their laser's colour, all others as faint crosses, into a copy
+    of a BGR picture of shape (height, width, 3).
     """
     drawn = draw_points(image, points.laser, points.pixels, points.used)
     draw_caption(drawn, posture_lines(posture), warn=not posture)
@@ -53,16 +43,10 @@ def draw_overlay(
 def draw_points(
     image: ImagePlane, laser: NDArray[np.integer], pixels: FloatArray, used: BoolArray
 ) -> ImagePlane:
-    """Return a copy of a BGR picture with stripe points drawn into it.
+    """Return a copy of a BGR picture (height, width, 3) with N stripe points drawn into it.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width, 3)
-    laser : integer array, shape (N,)
-    pixels : array, shape (N, 2)
-        Points outside of the picture, or not finite, are left out.
-    used : bool array, shape (N,)
-        Points that entered the posture: dots; others are faint crosses.
+    `pixels`, shape (N, 2): those outside of the picture, or not finite, are left out. `used`,
+    shape (N,): points that entered the posture become dots; others are faint crosses.
     """
     drawn = np.array(image, dtype=np.uint8)
     scale = max(1, round(int(drawn.shape[0]) / 800))
@@ -117,19 +101,8 @@ def draw_legend(image: ImagePlane, names: list[str]) -> None:
 class OverlayWriter(Closing):
     """Write pictures to an MP4 that stays readable if the program dies before `close`.
 
-    Parameters
-    ----------
-    path : Path
-        Written anew.
-    size : (int, int)
-        Width and height of the pictures; an odd one is padded to even, as H.264 needs.
-    fps : float
-        Frames per second.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    `size`: width and height of the pictures; an odd one is padded to even, as H.264 needs. Raises
+    `OutputError` if the file cannot be written.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
@@ -205,13 +178,12 @@ def _stamp(
 
 
 def _text_width(text: str, size: float) -> int:
-    width = 0
-    for part in _drawable(text):
-        if part in ("±", "°"):
-            width += round(18 * size)
-        else:
-            width += cv2.getTextSize(part, _FONT, size, _thickness(size))[0][0]
-    return width
+    return sum(
+        round(18 * size)
+        if part in "±°"
+        else cv2.getTextSize(part, _FONT, size, _thickness(size))[0][0]
+        for part in _drawable(text)
+    )
 
 
 def _thickness(size: float) -> int:
@@ -221,7 +193,7 @@ def _thickness(size: float) -> int:
 def _drawable(text: str) -> list[str]:
     """Split a text into what the font can draw and the two signs that it lacks."""
     safe = "".join(c if " " <= c <= "~" or c in "±°" else "?" for c in text)
-    return [part for part in safe.replace("±", "\0±\0").replace("°", "\0°\0").split("\0") if part]
+    return [part for part in re.split("([±°])", safe) if part]
 
 
 def _put(

@@ -28,8 +28,7 @@ QUALITY_EDGES = np.linspace(0.0, 1.0, 41)
 RESIDUAL_EDGES_MM = np.linspace(-50.0, 50.0, 1001)
 
 
-@dataclass(frozen=True, slots=True)
-class FramePoints:
+class FramePoints(NamedTuple):
     """Stripe points of one sample frame, M of them."""
 
     # Shape (M,).
@@ -124,22 +123,18 @@ def _columns(batch: Any) -> dict[str, NDArray[Any]]:
 
 
 class _Points(NamedTuple):
-    """Points of one batch, N of them."""
+    """Points of one batch, N of them; shape (N,)."""
 
-    # Shape (N,).
     frame: IntArray
     laser: IntArray
     label: IntArray
     used: NDArray[Any]
-    # x, y and z in `dome`, shape (N,) each, in metres.
-    xyz: list[FloatArray]
+    xyz: list[FloatArray]  # In `dome`, in metres.
+    uv: list[NDArray[Any]]  # In pixels.
 
 
 class _Gathered:
-    """Points of a dive, batch by batch.
-
-    `sample_frames`: numbers of frames whose points are kept.
-    """
+    """Points of a dive, batch by batch; those of sample frames are kept."""
 
     def __init__(self, track: Track, sample_frames: list[int]) -> None:
         n = len(track)
@@ -158,20 +153,15 @@ class _Gathered:
     def add(self, batch: dict[str, NDArray[Any]]) -> None:
         """Add one batch, as `_columns` gives it."""
         frame, laser, label = (batch[name].astype(np.int64) for name in ("frame", "laser", "label"))
-        points = _Points(
-            frame,
-            laser,
-            label,
-            batch["used"],
-            [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"],
-        )
+        xyz = [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"]
+        points = _Points(frame, laser, label, batch["used"], xyz, [batch["u_px"], batch["v_px"]])
         target, row = self._add_counts(points)
         planes = self._planes[row]
         self._add_residuals(points, target, row, planes)
         if "quality" in batch:
             quality = batch["quality"][target].astype(np.float64)
             _count(self.summary.quality, QUALITY_EDGES, laser[target], quality)
-        self._keep_samples(points, batch)
+        self._keep_samples(points)
         # Points of a frame without a posture have no place in the target's frame.
         known = np.isfinite(planes[:, 3])
         self._grow_cloud(points, target[known], planes[known])
@@ -210,7 +200,7 @@ class _Gathered:
         summary.n_squares[rows] += np.bincount(row - first)
         _count(summary.residual, RESIDUAL_EDGES_MM, points.laser[target][known], off_mm)
 
-    def _keep_samples(self, points: _Points, batch: dict[str, NDArray[Any]]) -> None:
+    def _keep_samples(self, points: _Points) -> None:
         """Keep the points of sample frames; a frame may go on in the next batch."""
         frame, laser, samples = points.frame, points.laser, self.summary.samples
         if not len(frame):
@@ -225,16 +215,11 @@ class _Gathered:
                 laser[mine],
                 points.label[mine].clip(0, len(Label) - 1),
                 points.used[mine],
-                np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64),
+                np.stack([axis[mine] for axis in points.uv], axis=-1).astype(np.float64),
                 np.stack([axis[mine] for axis in points.xyz], axis=-1),
             )
             old = samples.get(sample)
-            if old is not None:
-                names = new.__dataclass_fields__
-                new = FramePoints(
-                    *(np.concatenate([getattr(p, n) for p in (old, new)]) for n in names)
-                )
-            samples[sample] = new
+            samples[sample] = new if old is None else FramePoints(*map(_joined, old, new))
 
     def _grow_cloud(self, points: _Points, target: IntArray, planes: FloatArray) -> None:
         drawn = self._rng.random(len(target))
@@ -251,6 +236,10 @@ class _Gathered:
             kept = np.argpartition(keys, cloud)[:cloud]
             keys, places, laser = keys[kept], places[kept], laser[kept]
         self._keys, summary.cloud_in_target, summary.cloud_laser = keys, places, laser
+
+
+def _joined(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
+    return np.concatenate([first, second])
 
 
 def _count_cells(counts: IntArray, i: IntArray, j: IntArray) -> None:

@@ -83,9 +83,10 @@ def read_track(path: Path) -> Track:
     """
     columns, texts = _read_columns(path)
     order = np.argsort(columns["frame"], kind="stable")
-    posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
-    sigma = np.stack([columns[name] for name in _SIGMAS], axis=-1)[order]
-    total = np.stack([columns[name] for name in _TOTALS], axis=-1)[order]
+    posture, sigma, total = (
+        np.stack([columns[name] for name in names], axis=-1)[order]
+        for names in (POSTURE, _SIGMAS, _TOTALS)
+    )
     total = np.where(np.isfinite(total), total, sigma)
     words, (reasons, reason) = texts["valid"], texts["reason"]
     says_so = np.array([word.lower() in _TRUE for word in words.names])
@@ -112,22 +113,11 @@ def _first_field(frame: FloatArray, field: "_Words") -> Field | None:
 
 
 def read_truth(path: Path, track: Track) -> FloatArray:
-    """Read truth onto the frames of a track.
+    """Read truth, as `aqualvs.results.summary.read_truth` does, onto the frames of a track.
 
-    Parameters
-    ----------
-    path : Path
-        As `aqualvs.results.summary.read_truth` takes it.
-
-    Returns
-    -------
-    truth : array, shape (N, 3)
-        As `Track.posture`; NaN where the file has no such frame, or nothing was ahead.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read, or has postures of other frames only.
+    Returns it as `Track.posture`, shape (N, 3); NaN where the file has no such frame, or nothing
+    was ahead. Raises `SourceError` if the file cannot be read, or has postures of other frames
+    only.
     """
     rows = truth_by_frame(path)
     values = np.array([*rows.values()], dtype=np.float64).reshape(-1, 3)
@@ -253,16 +243,10 @@ def _words(column: Any, rows: BoolArray) -> _Words:
         return _Words(("None",), np.zeros(int(rows.sum()), np.int64))
     chunks = column.chunks
     found = np.concatenate([chunk.indices.to_numpy() for chunk in chunks])[rows]
-    occurs = np.bincount(found)
-    names = {
-        name: code
-        for code, name in enumerate(chunks[0].dictionary.to_pylist()[: len(occurs)])
-        if occurs[code]
-    }
-    ordered = tuple(sorted(names))
-    place = np.zeros(len(occurs), np.int64)
-    place[[names[name] for name in ordered]] = np.arange(len(ordered))
-    return _Words(ordered, place[found])
+    codes, place = np.unique(found, return_inverse=True)
+    names = [chunks[0].dictionary[code].as_py() for code in codes.tolist()]
+    order = sorted(range(len(names)), key=names.__getitem__)
+    return _Words(tuple(names[i] for i in order), np.argsort(order)[place])
 
 
 def _numbers(column: Any) -> FloatArray:

@@ -4,6 +4,7 @@
 `write_report` turns it into the page.
 """
 
+import contextlib
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -111,7 +112,9 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     with ThreadPoolExecutor(1) as beside:
         # FFmpeg works on the pictures while this thread counts points.
         wanted = sorted({*picture_rows, *holes.values()})
-        images = beside.submit(_decoded, source, track, wanted)
+        images = None
+        if not isinstance(source, str):
+            images = beside.submit(decode_frames, source, track, wanted)
         points, no_points = summarize_points(run_dir, track, frames)
         decoded, no_pictures = _decoded_or_why(source, images)
     samples = {} if points is None else points.samples
@@ -121,10 +124,13 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
         if row in decoded
     }
     rig = mapping(run, "rig")
-    lasers = _lasers(rig, points)
+    lasers = lasers_of(rig)[:MAX_LASERS]
+    seen = 0 if points is None else points.n_lasers
+    lasers += [LaserFacts.unknown(i) for i in range(len(lasers), seen)]
     names = [laser.name for laser in lasers]
     bare, no_bare = read_bare(run_dir, track)
     true, no_truth = noted_truth(run, track) if truth is None else (read_truth(truth, track), "")
+    missing = (fault, no_points, no_pictures, no_bare, no_truth, no_net)
     warnings = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
         title=Path(_source_name(run)).stem or run_dir.resolve().name,
@@ -144,27 +150,8 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
             for place, row in holes.items()
             if row in decoded
         },
-        warnings=[
-            text
-            for text in (
-                fault,
-                no_points,
-                no_pictures,
-                no_bare,
-                no_truth,
-                no_net,
-                *warnings,
-                *net_warnings(net),
-            )
-            if text
-        ],
+        warnings=[*filter(None, missing), *warnings, *net_warnings(net)],
     )
-
-
-def _lasers(rig: Mapping[str, Any], points: PointSummary | None) -> list[LaserFacts]:
-    known = lasers_of(rig)[:MAX_LASERS]
-    seen = points.n_lasers if points is not None else 0
-    return known + [LaserFacts.unknown(i) for i in range(len(known), seen)]
 
 
 def _source_name(run: Mapping[str, Any]) -> str:
@@ -178,18 +165,12 @@ def _source(run_dir: Path, run: Mapping[str, Any]) -> Path | str:
     path = _source_name(run)
     if not path:
         return "run.yaml names no source: sample frames come without pictures."
-    try:
+    # A name that the file system refuses is no file of it.
+    with contextlib.suppress(OSError):
         for place in (Path(path), run_dir / path):
             if place.is_file() or place.is_dir():
                 return place
-    except OSError:
-        # A name that the file system refuses is no file of it.
-        pass
     return f"{path} is not there any more: sample frames come without pictures."
-
-
-def _decoded(source: Path | str, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
-    return {} if isinstance(source, str) else decode_frames(source, track, rows)
 
 
 def _rows_of_holes(net: NetTables | None, track: Track) -> dict[HolePicture, int]:
@@ -200,10 +181,10 @@ def _rows_of_holes(net: NetTables | None, track: Track) -> dict[HolePicture, int
 
 
 def _decoded_or_why(
-    source: Path | str, decoded: "Future[dict[int, ImagePlane]]"
+    source: Path | str, decoded: "Future[dict[int, ImagePlane]] | None"
 ) -> tuple[dict[int, ImagePlane], str]:
-    if isinstance(source, str):
-        return {}, source
+    if decoded is None:
+        return {}, str(source)
     try:
         images = decoded.result()
     except SourceError as fault:
@@ -225,17 +206,9 @@ def write_report(run_dir: Path, *, truth: Path | None = None) -> Path:
         CSV with columns `frame,range_mm,pitch_deg,yaw_deg`, overlaid with the errors. None: the
         one that `run.yaml` names, where it is there and of this dive.
 
-    Returns
-    -------
-    path : Path
-        The page, `report.html` in `run_dir`. It carries all it needs and asks no network.
-
-    Raises
-    ------
-    SourceError
-        If `posture.csv`, or the truth, cannot be read or holds no frame.
-    OutputError
-        If the page cannot be written.
+    Returns the path of the page, `report.html` in `run_dir`, which carries all it needs and asks no
+    network. Raises `SourceError` if `posture.csv`, or the truth, cannot be read or holds no frame;
+    `OutputError` if the page cannot be written.
     """
     material = gather(run_dir, truth)
     text = html.page("report.html", _content(material))
@@ -261,11 +234,10 @@ def _content(m: Material) -> dict[str, object]:
         "subtitle": _subtitle(m.run),
         "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
         "warnings": html.notice(m.warnings),
-        "posture_lead": _posture_lead(m.track, m.truth),
+        "has_refusals": not m.track.valid.all(),
         "truth": None if m.truth is None else _errors_table(m.track, m.truth),
         "net": html.Raw(net_view(m.net, m.crops)),
-        "planes": [] if m.points is None else known,
-        "no_planes": _why_no_planes(m.points, known),
+        "planes": known,
         "labels": [(LABEL_COLOURS[label], _MARKS[label], LABEL_WORDS[label]) for label in Label],
         "cloud_points": _cloud_amount(m.points),
         "cloud_of_frames": bool(known),
@@ -279,9 +251,7 @@ def _content(m: Material) -> dict[str, object]:
         "quality_charts": [] if m.points is None else _quality_places(m.points),
         "housing": housing,
         "bare": None if m.bare is None else _bare_ranges(m.track, m.bare, housing),
-        "bare_errors": None
-        if m.bare is None or m.truth is None
-        else _both_errors(m.track.posture, m.bare, m.truth, housing),
+        "bare_errors": _both_errors(m, housing),
         "lasers": _laser_rows(m.lasers, "dome's centre" if origin == "dome" else "origin"),
         "facts": _fact_blocks(m.run),
         "footer": _footer(m.run, m.track),
@@ -312,9 +282,7 @@ _MARKS = ("●", "■", "▲", "★", "□", "✕", "◆", "○")
 def _subtitle(run: Mapping[str, Any]) -> str:
     """Return the rig's name, the source and its picture size, as far as they are known."""
     rig, source = mapping(run, "rig"), run.get("source")
-    said = []
-    if rig.get("name"):
-        said.append(f"Rig “{rig['name']}”")
+    said = [f"Rig “{rig['name']}”"] if rig.get("name") else []
     if isinstance(source, dict):
         said.append(f"source {source.get('path') or source.get('name') or 'unknown'}")
         size = source.get("size_px") or [source.get("width_px"), source.get("height_px")]
@@ -323,39 +291,21 @@ def _subtitle(run: Mapping[str, Any]) -> str:
     return ", ".join(said)
 
 
-def _posture_lead(track: Track, truth: FloatArray | None) -> str:
-    """Return the line above the posture's charts."""
-    words = "Bands: one standard deviation, by the frame alone and with the rig."
-    if not track.valid.all():
-        words += " Grey: no posture; point at it for the reason."
-    if truth is not None:
-        words += " Dashed: truth."
-    return words
-
-
 def _errors_table(track: Track, truth: FloatArray) -> tuple[int, str]:
     """Return the number of frames with both a posture and truth, and the table of the errors."""
     rms, worst, count = errors_against(truth, track.posture)
     if not count:
         return 0, ""
-    scale = (1e3, 1.0, 1.0)
+    names, scale = ("range, mm", "pitch, °", "yaw, °"), (1e3, 1.0, 1.0)
     rows = [
-        (f"{name}, {unit}", f"{s * r:.{digits}f}", f"{s * w:.{digits}f}")
-        for name, unit, digits, s, r, w in zip(
-            ("range", "pitch", "yaw"), ("mm", "°", "°"), (2, 3, 3), scale, rms, worst, strict=True
-        )
+        (name, f"{s * r:.{digits}f}", f"{s * w:.{digits}f}")
+        for name, digits, s, r, w in zip(names, (2, 3, 3), scale, rms, worst, strict=True)
     ]
     relative = np.abs(track.posture[:, 0] / truth[:, 0] - 1.0)
     relative = 100.0 * relative[np.isfinite(relative)]
     share = f"{np.sqrt((relative**2).mean()):.3f}", f"{relative.max():.3f}"
     rows.insert(1, ("range, %", *share))
     return count, html.table(("", "rms", "max"), rows)
-
-
-def _why_no_planes(points: PointSummary | None, known: list[int]) -> str:
-    if points is None:
-        return "The run left no points."
-    return "" if known else "The laser planes are unknown, so this view is left out."
 
 
 def _cloud_amount(points: PointSummary | None) -> str:
@@ -389,13 +339,13 @@ def _frame_counts(track: Track) -> str:
 
 def _quality_places(points: PointSummary) -> list[tuple[str, str]]:
     """Return the charts on the quality of the points that there are: identifier and title."""
-    places = [
-        ("chart-counts", "Target points per frame and laser", points.on_target.any()),
-        ("chart-rms", "Residuals over time", points.n_squares.any()),
-        ("chart-residual", "Residuals by laser", points.residual.any()),
-        ("chart-quality", "Stripe quality of target points", points.quality.any()),
-    ]
-    return [(name, title) for name, title, known in places if known]
+    places = (
+        ("counts", "Target points per frame and laser", points.on_target),
+        ("rms", "Residuals over time", points.n_squares),
+        ("residual", "Residuals by laser", points.residual),
+        ("quality", "Stripe quality of target points", points.quality),
+    )
+    return [(f"chart-{name}", title) for name, title, counts in places if counts.any()]
 
 
 def _bare_ranges(track: Track, bare: FloatArray, housing: str) -> tuple[int, str]:
@@ -416,27 +366,20 @@ def _laser_rows(lasers: list[LaserFacts], centre: str) -> str:
     rows = []
     for index, laser in enumerate(lasers):
         bent = " (bent sheet; the plane that fits it)" if laser.bent else ""
-        cells = ["–"] * 4
-        if np.isfinite(laser.offset):
-            cells = [signed(f"{v:+.5f}") for v in laser.normal]
-            cells.append(signed(f"{1e3 * laser.offset:.2f}"))
+        cells = [*(f"{v:+.5f}" for v in laser.normal), f"{1e3 * laser.offset:.2f}"]
+        cells = [signed(cell) if np.isfinite(laser.offset) else "–" for cell in cells]
         rows.append((html.Raw(html.swatch(index) + escape(laser.name + bent)), *cells))
     return html.table(head, rows)
 
 
 def _fact_blocks(run: Mapping[str, Any]) -> list[tuple[str, html.Raw]]:
     """Return rig, options and versions as tables with their titles."""
-    blocks = []
-    for title, key, skip in (
-        ("Rig", "rig", ("lasers", "solved_from", "points", "history")),
-        ("Source", "source", ()),
-        ("Options", "options", ()),
-        ("Versions", "versions", ()),
-        ("Summary", "summary", ("warnings",)),
-    ):
-        if content := mapping(run, key):
-            blocks.append((title, html.fact_table(facts(content, skip))))
-    return blocks
+    left_out = {"rig": ("lasers", "solved_from", "points", "history"), "summary": ("warnings",)}
+    return [
+        (key.capitalize(), html.fact_table(facts(content, left_out.get(key, ()))))
+        for key in ("rig", "source", "options", "versions", "summary")
+        if (content := mapping(run, key))
+    ]
 
 
 def _laser_counts(points: PointSummary, names: list[str]) -> str:
@@ -450,10 +393,12 @@ def _laser_counts(points: PointSummary, names: list[str]) -> str:
     return html.table(head, rows)
 
 
-def _both_errors(housed: FloatArray, bare: FloatArray, truth: FloatArray, housing: str) -> str:
+def _both_errors(m: Material, housing: str) -> str:
+    if m.bare is None or m.truth is None:
+        return ""
     rows = []
-    for name, posture in ((f"with the {housing}", housed), ("without it", bare)):
-        rms, worst, count = errors_against(truth, posture)
+    for name, posture in ((f"with the {housing}", m.track.posture), ("without it", m.bare)):
+        rms, worst, count = errors_against(m.truth, posture)
         if count:
             rows.append((name, f"{1e3 * rms[0]:.2f} mm", f"{1e3 * worst[0]:.2f} mm", f"{count}"))
     return html.table(("range error against truth", "rms", "max", "frames"), rows)

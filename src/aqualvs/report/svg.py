@@ -106,12 +106,8 @@ def words_at(x: float, y: float, words: str, *, anchor: str = "middle", kind: st
 
 def line(x1: float, y1: float, x2: float, y2: float, *, colour: str = EDGE, more: str = "") -> str:
     """Return a straight line; `more` are further attributes."""
-    return f'<path d="{segment(x1, y1, x2, y2)}" stroke="{colour}" fill="none"{more}/>'
-
-
-def segment(x1: float, y1: float, x2: float, y2: float) -> str:
-    """Return path data of one straight line."""
-    return f"M{num(x1)} {num(y1)}L{num(x2)} {num(y2)}"
+    path = f"M{num(x1)} {num(y1)}L{num(x2)} {num(y2)}"
+    return f'<path d="{path}" stroke="{colour}" fill="none"{more}/>'
 
 
 def box(x: float, y: float, width: float, height: float, *, fill: str, stroke: str) -> str:
@@ -144,27 +140,24 @@ def line_chart(series: Series) -> Raw:
     known = np.isfinite(series.y) & np.isfinite(series.x)
     if not known.any():
         return Raw('<p class="note">No value is known.</p>')
+    low, high = float(series.x[known].min()), float(series.x[known].max())
+    wider = 0.5 if low == high else 0.0
+    x_axis = Axis(low - wider, high + wider, _CHART.left, _CHART.width - _CHART.right)
     marks = [(x, words) for x, words in series.marks if math.isfinite(x)]
-    x_axis = _x_axis(series, known)
-    labels, lanes = _mark_text(marks, x_axis)
+    inside = sorted(mark for mark in marks if x_axis.low <= mark[0] <= x_axis.high)
+    labels, lanes = _mark_text(inside, x_axis)
     head = 10.0 + _CHART.lane * lanes
     y_axis = _y_axis(series, known, head)
     body = [
         *_scales(x_axis, y_axis, series),
         *_curve(series, known, x_axis, y_axis),
         *_level(series, x_axis, y_axis),
-        *_mark_lines(marks, x_axis, y_axis),
+        *_mark_lines(inside, x_axis, y_axis),
         *labels,
     ]
     alt = f"{series.title}: {series.y_label} over {series.x_label}"
     chart = svg(_CHART.width, y_axis.start + _CHART.foot, body, alt=alt, kind="line-chart")
     return Raw(chart + _legend(series, marks))
-
-
-def _x_axis(series: Series, known: BoolArray) -> Axis:
-    low, high = float(series.x[known].min()), float(series.x[known].max())
-    wider = 0.5 if low == high else 0.0
-    return Axis(low - wider, high + wider, _CHART.left, _CHART.width - _CHART.right)
 
 
 def _y_axis(series: Series, known: BoolArray, head: float) -> Axis:
@@ -187,10 +180,8 @@ def _scales(x_axis: Axis, y_axis: Axis, series: Series) -> list[str]:
     left, right, foot, head = x_axis.start, x_axis.end, y_axis.start, y_axis.end
     parts = []
     for y, words in y_axis.ticks(5):
-        parts += [
-            line(left, y, right, y, colour=GRID),
-            words_at(left - 8, y + 5, words, anchor="end"),
-        ]
+        parts.append(line(left, y, right, y, colour=GRID))
+        parts.append(words_at(left - 8, y + 5, words, anchor="end"))
     for x, words in x_axis.ticks(8):
         parts += [line(x, foot, x, foot + 5), words_at(x, foot + 21, words)]
     middle = 0.5 * (foot + head)
@@ -213,9 +204,12 @@ def _curve(series: Series, known: BoolArray, x_axis: Axis, y_axis: Axis) -> list
         half = np.nan_to_num(series.sigma[rows], nan=0.0, posinf=1e9)
         low = np.clip(y_axis.place(series.y[rows] - half), y_axis.end, y_axis.start)
         high = np.clip(y_axis.place(series.y[rows] + half), y_axis.end, y_axis.start)
-        around = "".join(_around(x[p], low[p], high[p]) for p in pieces)
+        around = "".join(
+            polyline(np.append(x[p], x[p][::-1]), np.append(low[p], high[p][::-1])) + "Z"
+            for p in pieces
+        )
         parts.append(f'<path d="{around}" fill="{BAND}"/>')
-    drawn = "".join(_polyline(x[p], y[p]) for p in pieces)
+    drawn = "".join(polyline(x[p], y[p]) for p in pieces)
     return [
         *parts,
         f'<path d="{drawn}" fill="none" stroke="{ACCENT}" stroke-width="2" '
@@ -223,13 +217,10 @@ def _curve(series: Series, known: BoolArray, x_axis: Axis, y_axis: Axis) -> list
     ]
 
 
-def _polyline(x: FloatArray, y: FloatArray) -> str:
+def polyline(x: FloatArray, y: FloatArray) -> str:
+    """Return path data of a line through places, shape (N,) each; of a dot for one place."""
     places = [f"{num(a)} {num(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True)]
     return f"M{places[0]}h0" if len(places) == 1 else "M" + "L".join(places)
-
-
-def _around(x: FloatArray, low: FloatArray, high: FloatArray) -> str:
-    return _polyline(np.append(x, x[::-1]), np.append(low, high[::-1])) + "Z"
 
 
 def _level_of(series: Series) -> tuple[str, float] | None:
@@ -249,7 +240,7 @@ def _mark_lines(marks: Sequence[tuple[float, str]], x_axis: Axis, y_axis: Axis) 
     more = ' stroke-width="1.4" stroke-dasharray="3 3"'
     return [
         line(x, y_axis.end - 4, x, y_axis.start, colour=OUTLIER, more=more)
-        for x in (x_axis.at(at) for at, _ in _inside(marks, x_axis))
+        for x in (x_axis.at(at) for at, _ in marks)
     ]
 
 
@@ -257,10 +248,8 @@ def _mark_text(marks: Sequence[tuple[float, str]], x_axis: Axis) -> tuple[list[s
     """Return the words of the first marks, in lanes in which they do not touch, and the lanes."""
     ends: list[float] = []
     parts = []
-    max_lanes = 4
-    max_words = 12
-    longest = 48
-    for at, words in _inside(marks, x_axis)[:max_words]:
+    max_lanes, max_words, longest = 4, 12, 48
+    for at, words in marks[:max_words]:
         short = words if len(words) <= longest else words[: longest - 1] + "…"
         width, x = _CHART.character * len(short) + 10.0, x_axis.at(at)
         start = max(min(x - 2.0, x_axis.end - width), 0.0)
@@ -273,10 +262,6 @@ def _mark_text(marks: Sequence[tuple[float, str]], x_axis: Axis) -> tuple[list[s
             words_at(start, 16.0 + _CHART.lane * lane, short, anchor="start", kind="mark-words")
         )
     return parts, len(ends)
-
-
-def _inside(marks: Sequence[tuple[float, str]], x_axis: Axis) -> list[tuple[float, str]]:
-    return sorted(mark for mark in marks if x_axis.low <= mark[0] <= x_axis.high)
 
 
 def _legend(series: Series, marks: Sequence[tuple[float, str]]) -> str:

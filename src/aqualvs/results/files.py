@@ -35,19 +35,8 @@ class AppendFile:
     """Write pieces to a file, each handed to the system at once.
 
     What has been appended survives the death of the process, though not a loss of power. A piece
-    that does not fit on the disk is taken back.
-
-    Parameters
-    ----------
-    path : Path
-        Created, or overwritten.
-    exclusive : bool
-        Whether to raise `FileExistsError` where there is a file.
-
-    Raises
-    ------
-    OSError
-        From the constructor and from `append`, as the system says it.
+    that does not fit on the disk is taken back. The file is created or, unless `exclusive`,
+    overwritten. The constructor and `append` raise `OSError` as the system says it.
     """
 
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
@@ -106,10 +95,9 @@ def is_locked(path: Path) -> bool:
 
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_REMEDIES = {
-    errno.EACCES: "choose a folder that you may write to",
-    errno.EPERM: "choose a folder that you may write to",
-    errno.EROFS: "choose a folder that you may write to",
+_REMEDIES = dict.fromkeys(
+    (errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that you may write to"
+) | {
     errno.ENOTDIR: "a part of this path is a file; choose another folder",
     errno.EEXIST: "this path is a file; choose another folder",
     errno.EISDIR: "this path is a folder; choose another name",
@@ -119,10 +107,7 @@ _REMEDIES = {
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn a fault of the operating system while writing to `path` into one line.
-
-    Raises `OutputError` in place of any `OSError`.
-    """
+    """Turn any `OSError` while writing to `path` into an `OutputError` of one line."""
     try:
         yield
     except OSError as fault:
@@ -146,8 +131,8 @@ def replace_text(path: Path, text: str) -> None:
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
-    Raises `OSError` as the system says it. Raises `ValueError` if it is no JSON in UTF-8, or nested
-    too deeply.
+    Raises `OSError` as the system says it, `ValueError` if it is no JSON in UTF-8, or nested too
+    deeply.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -194,17 +179,13 @@ class Claim(Closing):
         Command, as messages and records name it. Commands that write the same files share one.
     paths : sequence of Path
         Files, or folders that are the command's as a whole.
-    overwrite : bool
-        Whether to replace what the same command wrote.
     known : sequence of Path
         Files of one folder that the caller knows for the command's own, to be noted as such where
         the folder has no record at all: that of an earlier version, or a copy without its hidden
         files.
 
-    Raises
-    ------
-    OutputError
-        If one of the files exists and may not be replaced, or the folder cannot be written.
+    Raises `OutputError` if one of the files exists and may not be replaced, or the folder cannot be
+    written.
     """
 
     def __init__(
@@ -246,16 +227,14 @@ class Claim(Closing):
 
     def _check(self, path: Path, *, overwrite: bool) -> None:
         noted = _read_record(path.parent).get(path.name)
+        remedy = "move it away, or choose another place with -o"
         if not isinstance(noted, dict) or noted.get(_WRITER) != self._writer:
             raise OutputError(
-                f"{path}: exists, and 'aqualvs {self._writer}' did not write it; move it away, or "
-                "choose another place with -o"
+                f"{path}: exists, and 'aqualvs {self._writer}' did not write it; {remedy}"
             )
-        mark = noted.get(_MARK)
-        if mark is not None and mark != _fingerprint(path):
+        if noted.get(_MARK) not in (None, _fingerprint(path)):
             raise OutputError(
-                f"{path}: has changed since 'aqualvs {self._writer}' wrote it; move it away, or "
-                "choose another place with -o"
+                f"{path}: has changed since 'aqualvs {self._writer}' wrote it; {remedy}"
             )
         if not overwrite:
             raise OutputError(f"{path}: exists; choose another place with -o, or add --overwrite")

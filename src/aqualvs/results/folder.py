@@ -38,30 +38,13 @@ from aqualvs.scanning.scan import Scan
 from aqualvs.special_files import refuse_special
 
 POSTURE_COLUMNS = (
-    "frame",
-    "time_s",
-    "valid",
-    "reason",
-    "range_m",
-    "pitch_deg",
-    "yaw_deg",
-    "sigma_range_m",
-    "sigma_pitch_deg",
-    "sigma_yaw_deg",
-    "slant_range_m",
-    "nearest_m",
-    "n_points",
-    "n_water",
-    "curvature_x_per_m",
-    "curvature_z_per_m",
-    "sigma_curvature_x_per_m",
-    "sigma_curvature_z_per_m",
-    "sigma_range_rig_m",
-    "sigma_pitch_rig_deg",
-    "sigma_yaw_rig_deg",
-    "sigma_range_total_m",
-    "sigma_pitch_total_deg",
-    "sigma_yaw_total_deg",
+    *("frame", "time_s", "valid", "reason", "range_m", "pitch_deg", "yaw_deg"),
+    *("sigma_range_m", "sigma_pitch_deg", "sigma_yaw_deg"),
+    *("slant_range_m", "nearest_m", "n_points", "n_water"),
+    *("curvature_x_per_m", "curvature_z_per_m"),
+    *("sigma_curvature_x_per_m", "sigma_curvature_z_per_m"),
+    *("sigma_range_rig_m", "sigma_pitch_rig_deg", "sigma_yaw_rig_deg"),
+    *("sigma_range_total_m", "sigma_pitch_total_deg", "sigma_yaw_total_deg"),
 )
 """Curvatures, horizontal and vertical, are empty unless the target is a curved net. `sigma_range_m`
 and its like are due to the frame's noise, `sigma_..._rig_...` to the uncertainty of the rig, which
@@ -72,17 +55,8 @@ _N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
 class PostureCsv(Closing):
     """Writer of `posture.csv`, row by row as `AppendFile` does it.
 
-    Parameters
-    ----------
-    path : Path
-        Created, or overwritten.
-    shutter : Shutter
-        Of the camera; of an interlaced one, each row ends with the field, "top" or "bottom".
-
-    Raises
-    ------
-    OSError
-        From the constructor and from `write`, as the system says it.
+    With an interlaced shutter, each row ends with the field, "top" or "bottom". The constructor and
+    `write` raise `OSError` as the system says it.
     """
 
     def __init__(self, path: Path, shutter: Shutter = AT_ONCE) -> None:
@@ -177,23 +151,11 @@ _KILLED = "the run ended before it could close its files; the folder was complet
 
 
 class RunOutputs:
-    """Writer of a run's folder; a context manager that completes it however the run ends.
+    """Writer of a folder of `prepare_folder`; a context manager that completes it at the run's end.
 
-    Parameters
-    ----------
-    folder : Path
-        From `prepare_folder`.
-    source, rig, options : mapping
-        For `run.yaml`.
-    summary : RunSummary, optional
-        To which the frames are added; its monitors are those of the run.
-    shutter : Shutter
-        Of the camera.
-
-    Raises
-    ------
-    OutputError
-        From every method, if the disk is full or the folder cannot be written.
+    Source, rig and options are for `run.yaml`; frames are added to the summary, whose monitors are
+    those of the run. Every method raises `OutputError` if the disk is full or the folder cannot be
+    written.
     """
 
     def __init__(
@@ -252,9 +214,9 @@ class RunOutputs:
             else:
                 self._export.finish()
             (self.folder / POINTS_STREAM).unlink()
-            self._run_file.write(
-                self._final_status(fault), error=_error_text(fault), summary=self.summary.to_dict()
-            )
+            error = "" if fault is None else f"{fault}" or type(fault).__name__
+            status, summary = self._final_status(fault), self.summary.to_dict()
+            self._run_file.write(status, error=error, summary=summary)
         except OSError as full:
             refusal = OutputError(explain(self.folder, full))
             self._abandon(refusal)
@@ -282,23 +244,10 @@ class RunOutputs:
 def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
     """Make sure that a run can be written to `folder`, and remove the one that it replaces.
 
-    Parameters
-    ----------
-    folder : Path
-        Made if it does not exist.
-    overwrite : bool
-        Whether to remove the files of a run that is already there (`RUN_FILES`, no others).
-
-    Returns
-    -------
-    claim : Claim
-        To be closed when the folder is complete.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds a run and `overwrite` is not set, or files under a run's names that are
-        none of a run's, if another process is writing to it, or if it cannot be written.
+    With `overwrite` the files of a run that is already there are removed (`RUN_FILES`, no others).
+    Returns a claim, to be closed when the folder is complete. Raises `OutputError` if the folder
+    holds a run and `overwrite` is not set, or files under a run's names that are none of a run's,
+    if another process is writing to it, or if it cannot be written.
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -393,7 +342,3 @@ def _complete_run_file(folder: Path) -> None:
         "summary": summary_of(folder / POSTURE_CSV).to_dict(),
     }
     write_yaml(path, head | {key: value for key, value in content.items() if key not in known})
-
-
-def _error_text(fault: BaseException | None) -> str:
-    return "" if fault is None else f"{fault}" or type(fault).__name__

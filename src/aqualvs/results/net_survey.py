@@ -11,10 +11,9 @@ import csv
 import math
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -40,34 +39,20 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Label, Scan, ScanPoints
 
 if TYPE_CHECKING:
-    from aqualvs.nets.places import AlignedLog
     from aqualvs.nets.tables import UnrolledNet
 
 
-@dataclass(frozen=True, slots=True)
-class NetResult:
+class NetResult(NamedTuple):
     """Result of a net's evaluation, as written to its files."""
 
-    wall: "UnrolledNet"  # Stretches and holes on the unrolled net.
-    summary: dict[str, Any]  # The same in numbers, as `net.geojson` has it.
-    lines: list[str]  # The summary in words.
-    log: "AlignedLog | None"  # The vehicle's log.
+    summary: dict[str, Any]  # As `net.geojson` has it.
+    lines: list[str]  # The same in words.
 
 
 class NetPass:
     """Evaluation of a dive's net, scan by scan, and the writer of its files.
 
-    Parameters
-    ----------
-    rig : Rig
-        That the scans were made with.
-    request : NetRequest
-        What to find out; its log is read at once.
-
-    Raises
-    ------
-    AqualvsError
-        If the log cannot be read.
+    The log of the request is read at once; raises `AqualvsError` if it cannot be read.
     """
 
     def __init__(self, rig: Rig, request: NetRequest) -> None:
@@ -77,7 +62,8 @@ class NetPass:
         self._rig, self._request = rig, request
         self._log = open_log(request.log, request.log_offset_s)
         self._condition = NetCondition(rig, request.options())
-        self._postures = [array("d") for _ in range(4)]
+        # Time, range, pitch and yaw, four numbers a frame.
+        self._postures = array("d")
         self._n_frames = 0
 
     def add(self, scan: Scan) -> None:
@@ -86,27 +72,15 @@ class NetPass:
         posture = scan.posture
         if not isinstance(posture, Posture) or not _is_net(scan):
             return
-        values = (scan.time_s, posture.range, posture.pitch, posture.yaw)
-        for column, value in zip(self._postures, values, strict=True):
-            column.append(value)
+        self._postures.extend((scan.time_s, posture.range, posture.pitch, posture.yaw))
         self._condition.add(scan)
 
     def write(self, folder: Path, video: Path | None = None) -> NetResult:
-        """Finish, write the files of `NET_FILES` and return the result.
+        """Finish, write the files of `NET_FILES` into a folder that exists; return the result.
 
-        Parameters
-        ----------
-        folder : Path
-            That exists.
-        video : Path or None
-            Of the dive; its clock may help to lay the log on it.
-
-        Raises
-        ------
-        OutputError
-            If a file cannot be written.
-        OptionError
-            If the twine was given thicker than the mesh's bars are long.
+        The clock of the dive's video may help to lay the log on it. Raises `OutputError` if a file
+        cannot be written, `OptionError` if the twine was given thicker than the mesh's bars are
+        long.
         """
         from aqualvs.nets.places import DivePostures, align_log, place_net
         from aqualvs.nets.tables import net_dict, net_lines, unroll
@@ -114,7 +88,7 @@ class NetPass:
         self._condition.finish()
         stretches, holes = self._condition.stretches, self._condition.holes
         self._check_twine([one.lattice.bar for one in stretches if one.lattice is not None])
-        postures = DivePostures(*(np.array(column) for column in self._postures))
+        postures = DivePostures(*np.array(self._postures).reshape(-1, 4).T.copy())
         log = None
         if self._log is not None:
             log = align_log(self._log, postures, self._request.log_offset_s, video)
@@ -133,7 +107,7 @@ class NetPass:
         lines = net_lines(wall, area, self._n_frames)
         if log is not None:
             lines += [*log.log.notes, log.words()]
-        return NetResult(wall, summary, lines, log)
+        return NetResult(summary, lines)
 
     def _check_twine(self, bars: Sequence[float]) -> None:
         twine_mm = self._request.twine_mm
@@ -210,7 +184,9 @@ def read_run(run_folder: str | Path) -> Iterator[Scan]:
     Memory holds one batch of points, however long the dive.
     """
     folder = Path(run_folder)
-    points, path = _StoredPoints(folder), folder / POSTURE_CSV
+    points, path = _points_by_frame(folder), folder / POSTURE_CSV
+    none = _scan_points([])
+    frame, found = -math.inf, none
     for row in _posture_rows(path):
         try:
             index, posture = int(row["frame"]), _posture(row)
@@ -220,7 +196,10 @@ def read_run(run_folder: str | Path) -> Iterator[Scan]:
                 f"{path}: frame {row['frame']} holds a value that is not a number "
                 f"({fault}); fix the row"
             ) from fault
-        yield Scan(index, time_s, posture, points.of(index), n_water)
+        while frame < index:
+            frame, found = next(points, (math.inf, none))
+        here, found = (found, none) if frame == index else (none, found)
+        yield Scan(index, time_s, posture, here, n_water)
 
 
 def check_stored(run_folder: Path) -> None:
@@ -296,27 +275,13 @@ def _number(text: str | None) -> float:
     return float(text) if text else math.nan
 
 
-class _StoredPoints:
-    """The points of a run, asked for frame by frame in ascending order."""
-
-    def __init__(self, run_folder: Path) -> None:
-        self._parts = _points_by_frame(run_folder)
-        self._waiting: tuple[int, Columns] | None = None
-
-    def of(self, frame: int) -> ScanPoints:
-        """Return the points of a frame; none where it has none."""
-        found: list[Columns] = []
-        while (piece := self._waiting or next(self._parts, None)) is not None:
-            self._waiting = piece
-            if piece[0] > frame:
-                break
-            if piece[0] == frame:
-                found.append(piece[1])
-            self._waiting = None
-        return _scan_points(found)
+def _points_by_frame(run_folder: Path) -> Iterator[tuple[int, ScanPoints]]:
+    """Yield each frame's points, in ascending order; frames without points are left out."""
+    for frame, parts in groupby(_parts_of_frames(run_folder), key=lambda part: part[0]):
+        yield frame, _scan_points([columns for _, columns in parts])
 
 
-def _points_by_frame(run_folder: Path) -> Iterator[tuple[int, Columns]]:
+def _parts_of_frames(run_folder: Path) -> Iterator[tuple[int, Columns]]:
     """Yield each frame's points, in parts where the file's batches split them."""
     for columns in _batches(run_folder):
         frame = columns["frame"]

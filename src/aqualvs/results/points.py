@@ -12,13 +12,14 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import parquet
 
+from aqualvs.closing import Closing
 from aqualvs.errors import OutputError
 from aqualvs.results.files import AppendFile, is_locked
 from aqualvs.scanning.scan import Label, Scan
@@ -47,20 +48,10 @@ half of that.
 _LABEL_NAMES = pa.array(LABELS, pa.string())
 
 
-class PointsStream:
-    """Writer of `points.arrows`, a few frames at a time as `AppendFile` does it.
+class PointsStream(Closing):
+    """Writer of `points.arrows`, a few frames at a time, with the parameters of `AppendFile`.
 
-    Parameters
-    ----------
-    path : Path
-        Created, or overwritten.
-    exclusive : bool
-        As for `AppendFile`.
-
-    Raises
-    ------
-    OSError
-        From the constructor and from `write`, as the system says it.
+    The constructor and `write` raise `OSError` as the system says it.
     """
 
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
@@ -104,13 +95,9 @@ class PointsStream:
         self._waiting.seek(0)
         self._waiting.truncate()
 
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(self, _kind: object, fault: BaseException | None, _trace: object) -> None:
+    def __exit__(self, *raised: object) -> None:
         """Finish the stream, or leave it as it is where writing failed."""
-        if isinstance(fault, OSError):
+        if isinstance(raised[1], OSError):
             self.abandon()
         else:
             self.close()
@@ -120,17 +107,11 @@ def points_batch(*scans: Scan) -> Any:
     """Return the points of frames as a record batch of `POINTS_SCHEMA`."""
     points = [scan.points for scan in scans]
     counts = [len(one) for one in points]
-    numbers = np.empty((9, sum(counts)), np.float32)
-    end = 0
-    for one in points:
-        first, end = end, end + len(one)
-        mine = numbers[:, first:end]
-        mine[0:2] = one.pixels.T
-        mine[2:5] = one.points_in_dome.T
-        mine[5] = one.sigma
-        mine[6] = one.quality
-        mine[7] = one.intensity
-        mine[8] = one.width
+    rows = [
+        (*one.pixels.T, *one.points_in_dome.T, one.sigma, one.quality, one.intensity, one.width)
+        for one in points
+    ]
+    numbers = [np.concatenate(parts).astype(np.float32) for parts in zip(*rows, strict=True)]
     head = (
         np.repeat(np.array([scan.index for scan in scans], np.int32), counts),
         np.repeat(np.array([scan.time_s for scan in scans]), counts),
@@ -163,12 +144,8 @@ def points_file(run_folder: Path) -> Path:
 def stored_batches(path: Path, rows: int, columns: Sequence[str] | None = None) -> Iterator[Any]:
     """Yield the record batches of `points_file`, the first without rows.
 
-    Parameters
-    ----------
-    rows : int
-        Of a batch of a Parquet file, at most: memory stays flat however long the dive.
-    columns : sequence of str, optional
-        Those of a Parquet file that are read if they are there; all of them if left out.
+    Those of a Parquet file have at most `rows` rows, so that memory stays flat however long the
+    dive, and of its columns the given ones, as far as they are there.
     """
     if path.suffix == ".arrows":
         yield from read_points_stream(path)
@@ -193,10 +170,7 @@ def plain_column(column: Any, *, labels: bool) -> NDArray[Any]:
 
 
 def check_idle(path: Path) -> None:
-    """Raise if another process is still writing this journal.
-
-    Raises `OutputError` if it is.
-    """
+    """Raise `OutputError` if another process is still writing this journal."""
     if is_locked(path):
         raise OutputError(
             f"{path.parent}: a run is still writing here; wait for its end or stop it first"
@@ -226,20 +200,10 @@ class PointsExport:
 
     Rows are gathered to groups of always the same size, which a thread of its own writes: the files
     do not depend on how the points come, and memory does not grow with their number.
-
-    Parameters
-    ----------
-    points_ply : Path
-        Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser; of the points that
-        entered a posture.
-    schema : pyarrow.Schema
-        Columns of what will be added: `POINTS_SCHEMA`, or those of an older journal.
-
-    Raises
-    ------
-    OSError
-        From every method, as the system says it, a full disk for example; `discard` is to be called
-        then.
+    `points.ply` is a binary PLY of the points that entered a posture: x, y, z in `dome` in metres,
+    red, green, blue by laser. `schema`: columns of what will be added, `POINTS_SCHEMA` or those of
+    an older journal. Every method raises `OSError` as the system says it, a full disk for example;
+    `discard` is to be called then.
     """
 
     def __init__(
@@ -315,22 +279,10 @@ class PointsExport:
 
 
 def export_points(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> int:
-    """Write record batches to the files of `PointsExport`, with the columns of the first batch.
+    """Write record batches, as of `read_points_stream`, to the files of `PointsExport`.
 
-    Parameters
-    ----------
-    batches : iterator of pyarrow.RecordBatch
-        As `read_points_stream` yields them.
-
-    Returns
-    -------
-    n_points : int
-        Points in `points_parquet`.
-
-    Raises
-    ------
-    OSError
-        As the system says it, a full disk for example; nothing is left of the files.
+    Returns the number of points. Raises `OSError` as the system says it, a full disk for example;
+    nothing is left of the files then.
     """
     first = next(batches, None)
     schema = POINTS_SCHEMA if first is None else first.schema

@@ -67,11 +67,8 @@ class RunFile:
             content["error"] = error
         if summary is not None:
             content["summary"] = dict(summary)
-        content["source"] = dict(self.source)
-        content["options"] = dict(self.options)
-        content["versions"] = versions()
-        content["rig"] = dict(self.rig)
-        write_yaml(self.path, content)
+        content |= {"source": dict(self.source), "options": dict(self.options)}
+        write_yaml(self.path, content | {"versions": versions(), "rig": dict(self.rig)})
 
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
@@ -275,13 +272,8 @@ class RunRequest:
 def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> ScannerOptions:
     """Return the scanner's options from the words of the command line.
 
-    Parameters
-    ----------
-    target : str
-        "auto", "net", "solid" or the path of a target file, see `target_file`.
-    detector : {"ridge", "threshold"}
-    mesh_filter : {"none", "paper"}
-    fit : {"robust", "pseudo_inverse"}
+    `target`: "auto", "net", "solid" or the path of a target file, see `target_file`. `detector`:
+    "ridge" or "threshold". `mesh_filter`: "none" or "paper". `fit`: "robust" or "pseudo_inverse".
     """
     facts = target_dict(target)
     return ScannerOptions(
@@ -322,10 +314,7 @@ def in_water(rig: Rig, water: Water, *, no_dome: bool) -> Rig:
 
 
 def check_fits(source: FrameSource, rig: Rig) -> None:
-    """Raise if the pictures are not of the size that the rig was calibrated for.
-
-    Raises `SourceError` if they are not.
-    """
+    """Raise `SourceError` if the pictures are not of the size that the rig was calibrated for."""
     if source.size_px != rig.size_px:
         have, need = ("x".join(map(str, size)) for size in (source.size_px, rig.size_px))
         raise SourceError(
@@ -354,8 +343,7 @@ def checked_index(n: float, option: str) -> float:
     Raises `OptionError` if it is that of no medium one dives in.
     """
     # Air is 1.0003, the densest brine about 1.39.
-    index_limits = (1.0, 1.5)
-    low, high = index_limits
+    low, high = 1.0, 1.5
     if not low <= n <= high:
         raise OptionError(f"{option} {n:g}: no water; give a value from {low} to {high}")
     return n

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import json
 import math
 import statistics
 from array import array
@@ -68,20 +69,10 @@ class TruthComparison:
 
 
 def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
-    """Compare the valid postures of a run with the truth of the same frames.
+    """Compare the valid postures of a run with the truth of the same frames, as of `read_truth`.
 
-    Parameters
-    ----------
-    posture_csv : Path
-        As a run writes it.
-    truth_csv : Path
-        As `read_truth` takes it.
-
-    Raises
-    ------
-    SourceError
-        If a file cannot be read, lacks a column, or no frame is in both. A truth without any
-        posture, as of empty water, is of all dives.
+    Raises `SourceError` if a file cannot be read, lacks a column, or no frame is in both. A truth
+    without any posture, as of empty water, is of all dives.
     """
     measured_rows, true_rows = _rows(posture_csv), _rows(truth_csv)
     in_fields, of_fields = ("field" in rows[0] for rows in (measured_rows, true_rows))
@@ -100,8 +91,10 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
             f"{posture_csv}; give the truth of this dive"
         )
     common = sorted(measured.keys() & known)
-    got = np.array([measured[frame] for frame in common]).reshape(-1, 3)
-    true = np.array([truth[frame] for frame in common]).reshape(-1, 3)
+    got, true = (
+        np.array([postures[frame] for frame in common]).reshape(-1, 3)
+        for postures in (measured, truth)
+    )
     error = got - true
     return TruthComparison(
         n_compared=len(common),
@@ -189,10 +182,10 @@ def range_column(path: Path, row: Row) -> str:
 
     Raises `SourceError` if it has none.
     """
-    for name in RANGE_UNITS:
-        if name in row:
-            return name
-    raise SourceError(f"{path}: no column range_m or range_mm; name it in the first line")
+    found = next((name for name in RANGE_UNITS if name in row), None)
+    if found is None:
+        raise SourceError(f"{path}: no column range_m or range_mm; name it in the first line")
+    return found
 
 
 def _number(text: str | None) -> float:
@@ -269,14 +262,8 @@ class RunSummary:
 
         Raises `OSError` as the system says it.
         """
-        stored: dict[str, NDArray[Any]] = {
-            "ranges": np.asarray(self.ranges),
-            "reasons": np.array(list(self.refused), np.str_),
-            "counts": np.array(list(self.refused.values()), np.int64),
-            "example_reasons": np.array(list(self.examples), np.str_),
-            "example_frames": np.array([one for one, _ in self.examples.values()], np.int64),
-            "example_details": np.array([one for _, one in self.examples.values()], np.str_),
-        }
+        refusals = json.dumps([self.refused, self.examples])
+        stored = {"ranges": np.asarray(self.ranges), "refusals": np.array(refusals)}
         if self.agreement is not None:
             stored |= {_AGREEMENT + key: value for key, value in self.agreement.arrays().items()}
         if self.net_check is not None:
@@ -291,12 +278,9 @@ class RunSummary:
         with np.load(path) as file:
             stored: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}
         self.ranges.extend(stored["ranges"].tolist())
-        for reason, count in zip(
-            stored["reasons"].tolist(), stored["counts"].tolist(), strict=True
-        ):
-            self.refused[reason] += count
-        names = ("example_reasons", "example_frames", "example_details")
-        for reason, index, detail in zip(*(stored[name].tolist() for name in names), strict=True):
+        refused, examples = json.loads(str(stored["refusals"]))
+        self.refused.update(refused)
+        for reason, (index, detail) in examples.items():
             self.examples.setdefault(reason, (index, detail))
         if self.agreement is not None:
             n = len(_AGREEMENT)
@@ -345,8 +329,8 @@ class RunSummary:
             text.append(f"no posture: {', '.join(counts)}")
         if example := self.example():
             text.append(f"  {example}")
-        sentence = "" if self.agreement is None else self.agreement.verdict().sentence()
-        about_net = "" if self.net_check is None else self.net_check.sentence()
+        sentence = self.agreement and self.agreement.verdict().sentence()
+        about_net = self.net_check and self.net_check.sentence()
         text += [words for words in (sentence, about_net) if words]
         return text + [f"warning: {words}" for words in self.warnings]
 
