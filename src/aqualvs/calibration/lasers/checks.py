@@ -412,7 +412,7 @@ def check_count(
         for plane in named_planes
     ]
     # Their stripes need no further remark; those of other planes do.
-    taken = [line for plane in named_planes for line in plane.members.tolist()]
+    taken = [line for plane in named_planes for line in plane.candidate.members.tolist()]
     counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
     # Share of the weakest laser's points in a picture from which a further stripe is reported.
     as_strong = 0.5
@@ -447,7 +447,7 @@ def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: TargetSurf
     """Return the number of a plane's points and the pictures it is seen in."""
     patches = plane.patches
     rest = f" and {len(patches) - 1} more" if len(patches) > 1 else ""
-    return f"{len(plane.members)} points in {_where(patches[0], views, surfaces)}{rest}"
+    return f"{len(plane.candidate.members)} points in {_where(patches[0], views, surfaces)}{rest}"
 
 
 def typical_corner_error_px(views: Sequence[PlacedView]) -> float:

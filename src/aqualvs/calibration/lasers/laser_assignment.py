@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.calibration.lasers.candidates import (
+    LineTable,
     PlaneCandidate,
     StripeLine,
     find_candidates,
@@ -59,51 +60,32 @@ class JudgedPlane:
     """Plane of light with the verdict on it."""
 
     candidate: PlaneCandidate
-    members: IntArray  # Shape (M,): indices of its points.
     patches: tuple[int, ...]  # Surfaces of views that it is seen on.
     verdict: PlaneVerdict
     why: str = ""  # In words, the reason why it is no laser or may be none; empty for lasers.
 
 
 def judged(
-    pooled: PooledStripes,
-    lines: Sequence[StripeLine],
-    candidates: Sequence[PlaneCandidate],
-    lens_in_dome: FloatArray,
+    table: LineTable, candidates: Sequence[PlaneCandidate], lens_in_dome: FloatArray
 ) -> list[JudgedPlane]:
-    """Judge planes by their evidence, and by each other.
+    """Judge planes by their evidence, and by each other; return them by verdict and evidence.
 
-    Parameters
-    ----------
-    pooled : PooledStripes
-        Points of all views.
-    lines : sequence of StripeLine
-        Of all surfaces.
-    candidates : sequence of PlaneCandidate
-        As returned by `find_candidates`.
-    lens_in_dome : array, shape (3,)
-        The lens's projection centre.
-
-    Returns
-    -------
-    list of JudgedPlane
-        By verdict, then by evidence.
+    `candidates`: the best first. `lens_in_dome`, shape (3,): the lens's projection centre.
     """
-    alarms = np.array([c.log_false_alarms for c in candidates])
-    n_sure = _n_sure(alarms)
-    stay = _stay_in_picture(pooled, lines, candidates, lens_in_dome)
+    pooled = table.pooled
+    n_sure = _n_sure(np.array([c.log_false_alarms for c in candidates]))
+    stay = _stay_in_picture(pooled, candidates, lens_in_dome)
+    # Planes with light on the target are judged before those beside it.
+    beside = [float(np.mean(pooled.on_target[c.members])) < 1.0 - _SURE.most for c in candidates]
     seen: list[JudgedPlane] = []
-    for i in _by_target(pooled, lines, candidates):
-        candidate = candidates[i]
-        members = _members(lines, candidate)
-        fault = _fault(pooled, candidate, members, seen)
+    for i in sorted(range(len(candidates)), key=lambda i: (beside[i], i)):
+        fault = _fault(pooled, candidates[i], seen)
         if stay[i]:
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to distinguish it from chance"
-        verdict, why = fault or (PlaneVerdict.LASER, "")
-        patches = tuple(np.unique(pooled.patch[members]).tolist())
-        seen.append(JudgedPlane(candidate, members, patches, verdict, why))
+        patches = tuple(np.unique(pooled.patch[candidates[i].members]).tolist())
+        seen.append(JudgedPlane(candidates[i], patches, *(fault or (PlaneVerdict.LASER, ""))))
     ranks = list(PlaneVerdict)
     return sorted(seen, key=lambda j: (ranks.index(j.verdict), j.candidate.log_false_alarms))
 
@@ -115,24 +97,11 @@ def _n_sure(log_alarms: FloatArray) -> int:
     return int(good[-1]) + 1 if len(good) else 0
 
 
-def _members(lines: Sequence[StripeLine], candidate: PlaneCandidate) -> IntArray:
-    return np.concatenate([lines[int(i)].members for i in candidate.lines])
-
-
-def _by_target(
-    pooled: PooledStripes, lines: Sequence[StripeLine], candidates: Sequence[PlaneCandidate]
-) -> list[int]:
-    """Return the order of judging: planes with light on the target before those beside it."""
-    beside = [
-        float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _SURE.most for c in candidates
-    ]
-    return sorted(range(len(candidates)), key=lambda i: (beside[i], i))
-
-
 def _fault(
-    pooled: PooledStripes, candidate: PlaneCandidate, members: IntArray, seen: Sequence[JudgedPlane]
+    pooled: PooledStripes, candidate: PlaneCandidate, seen: Sequence[JudgedPlane]
 ) -> tuple[PlaneVerdict, str] | None:
     """Return the reason against a plane as a laser of its own, or None."""
+    members = candidate.members
     if len(members) < _SURE.min_points:
         return PlaneVerdict.OTHER, f"it has {len(members)} points only"
     if _is_fixed(pooled, members):
@@ -141,11 +110,10 @@ def _fault(
             "camera sideways, or turn it, between pictures"
         )
     for other in seen:
-        if other.verdict is PlaneVerdict.OTHER:
-            continue
-        fault = _same_light(pooled, members, other)
-        if fault is not None:
-            return fault
+        if other.verdict is not PlaneVerdict.OTHER:
+            fault = _same_light(pooled, members, other)
+            if fault is not None:
+                return fault
     best = min(
         (other.candidate.residual_px for other in seen if other.verdict is PlaneVerdict.LASER),
         default=np.inf,
@@ -178,7 +146,7 @@ def _same_light(
         return PlaneVerdict.TORN, (
             f"it is {distance:.0f} px away from a laser that is seen in other pictures"
         )
-    goes_on = sum(_goes_on(pooled, members, other.members, patch) for patch in shared)
+    goes_on = sum(_goes_on(pooled, members, other.candidate.members, patch) for patch in shared)
     if len(shared) >= 2 and goes_on >= _SURE.most * len(mine):
         return (
             PlaneVerdict.OTHER,
@@ -212,10 +180,7 @@ def _direction(points: FloatArray) -> FloatArray:
 
 
 def _stay_in_picture(
-    pooled: PooledStripes,
-    lines: Sequence[StripeLine],
-    candidates: Sequence[PlaneCandidate],
-    lens_in_dome: FloatArray,
+    pooled: PooledStripes, candidates: Sequence[PlaneCandidate], lens_in_dome: FloatArray
 ) -> BoolArray:
     """Mark planes (C,) whose stripe stays in one place of the picture, near or far.
 
@@ -232,7 +197,7 @@ def _stay_in_picture(
     near = np.zeros(len(candidates), np.bool_)
     own_px, fixed_px = np.zeros((2, len(candidates)))
     for i, candidate in enumerate(candidates):
-        members, plane = _members(lines, candidate), candidate.plane
+        members, plane = candidate.members, candidate.plane
         near[i] = abs(float(plane.signed_distance(lens_in_dome))) < min_baseline
         fixed = fitted_plane(pooled.placed, members, plane, through=lens_in_dome)
         away = np.abs(plane_residuals_px(pooled.placed, [plane, fixed])[members])
@@ -244,8 +209,7 @@ def _stay_in_picture(
 
 def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
     """Return whether the points stay on one line of each surface of the target in all views."""
-    worst = 0.0
-    several = False
+    worst, several = 0.0, False
     for surface in np.unique(pooled.placed.surface[members]):
         mine = members[pooled.placed.surface[members] == surface]
         views = np.unique(pooled.view[mine])
@@ -341,11 +305,11 @@ def assign_lasers(
         undecided ones, if they are clearly better than the other undecided ones.
     """
     lines = _all_lines(pooled)
-    found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
+    table = LineTable.of(pooled, lines, tolerance_px)
+    found = judged(table, find_candidates(table), lens_in_dome)
     taken = [plane for plane in found if plane.verdict is PlaneVerdict.LASER]
     if n_lasers is not None and len(taken) < n_lasers:
-        side_by_side = ordered_candidates(pooled, lines, n_lasers, tolerance_px)
-        ordered = judged(pooled, lines, side_by_side, lens_in_dome)
+        ordered = judged(table, ordered_candidates(table, n_lasers), lens_in_dome)
         if ordered and all(plane.verdict is PlaneVerdict.LASER for plane in ordered):
             found = taken = ordered
     in_planes = {int(i) for plane in found for i in plane.candidate.lines}
