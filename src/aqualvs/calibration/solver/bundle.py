@@ -46,9 +46,7 @@ class KnownDistance:
         by_turn = np.array([ny * z - nz * y, nz * x - nx * z, nx * y - ny * x])
         jacobian = np.concatenate([by_turn, normal]) / (normal[1] * self.sigma)
         residual = np.array([[(found - self.distance) / self.sigma]])
-        return [
-            Block(DISTANCES, columns, residual, jacobian[None, None, :], RobustLoss.HUBER, False)
-        ]
+        return [Block(DISTANCES, columns, residual, jacobian[None, None, :], scaled=False)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,20 +66,13 @@ class SquareBoard:
         off_square = dome_from_target.rotation @ self.square.T
         tilt = tilt_of(off_square)
         by_turn = 0.5 * (np.trace(off_square) * np.eye(3) - off_square)
-        return [
-            Block(
-                group,
-                columns[:3],
-                tilt[None, axes] / sigma,
-                by_turn[None, axes, :] / sigma,
-                RobustLoss.CAUCHY,
-                False,
-            )
-            for group, axes, sigma in (
-                (TILTS, [0, 2], self.board_tilt_sigma),
-                (ROLLS, [1], self.roll_sigma),
-            )
-        ]
+
+        def block(group: str, axes: list[int], sigma: float) -> Block:
+            slopes = by_turn[None, axes, :] / sigma
+            off = tilt[None, axes] / sigma
+            return Block(group, columns[:3], off, slopes, RobustLoss.CAUCHY, scaled=False)
+
+        return [block(TILTS, [0, 2], self.board_tilt_sigma), block(ROLLS, [1], self.roll_sigma)]
 
 
 def tilt_of(off_square: FloatArray) -> FloatArray:
@@ -108,14 +99,8 @@ _ROTATION = POSE_PARAMETERS[3:]
 def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty) -> list[Block]:
     """Return the deviation of a rig from its prior, in sigmas.
 
-    Parameters
-    ----------
-    start, rig : Rig
-        Mean of the prior, and the present rig.
-    free : sequence of str
-        Numbers of the columns 0, 1, ... of the solve.
-    priors : RigUncertainty
-        Uncertainty of `start`; numbers that it does not name have no prior.
+    The prior has the mean `start` and the uncertainty `priors`; numbers that it does not name have
+    none. `free` are the numbers of the columns 0, 1, ... of the solve.
     """
     known = [name for name in free if name in priors.names]
     if not known:
@@ -127,16 +112,10 @@ def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty)
 def media_prior(
     start: FloatArray, media: FloatArray, sigma: FloatArray, columns: IntArray
 ) -> list[Block]:
-    """Return the deviation of media from their priors, in sigmas.
+    """Return the deviation of the indices (M,) of free media from their priors, in sigmas.
 
-    Parameters
-    ----------
-    start, media : array, shape (M,)
-        Indices of the free media: prior means, and present values.
-    sigma : array, shape (M,)
-        Standard deviations of the prior; infinite where there is none.
-    columns : int array, shape (M,)
-        Of the media in the solve.
+    The priors have means `start` and standard deviations `sigma` (M,), infinite where there is no
+    prior.
     """
     bounded = np.isfinite(sigma)
     if not bounded.any():
@@ -168,13 +147,8 @@ def _prior(columns: IntArray, moved: FloatArray, whiten: FloatArray) -> Block:
 def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
     """Return `dome_from_target` turned about a point of the target, then shifted.
 
-    Parameters
-    ----------
-    pose : SE3
-    middle : array, shape (3,)
-        Centre of the turn, in the target's frame.
-    step : array, shape (6,)
-        Rotation vector (radians) and shift (metres), both in `dome`.
+    `middle` (3,) is that point in the target's frame; `step` (6,) has a rotation vector (radians)
+    and a shift (metres), both in `dome`.
     """
     turn, arm = rotation_from_rotvec(step[:3]), pose.rotation @ middle
     # The middle lies at arm + translation, and stays there under the turn.
@@ -182,14 +156,9 @@ def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
 
 
 def point_by_pose(points_in_dome: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the derivative (N, 3, 6) of points by the step of `moved_target` at zero.
+    """Return the derivative (N, 3, 6) of points (N, 3) by the step of `moved_target` at zero.
 
-    Parameters
-    ----------
-    points_in_dome : array, shape (N, 3)
-        Points of the target.
-    centre : array, shape (3,)
-        Centre of the turn, in `dome`.
+    `centre` (3,): of the turn, in `dome`.
     """
     by_pose = np.zeros((len(points_in_dome), 3, 6))
     by_pose[:, :, :3] = -skew(points_in_dome - centre)

@@ -152,35 +152,10 @@ _TINY = 1e-6
 _MIN_FREEDOM = 0.5
 
 
-def start_scales(blocks: Sequence[Block]) -> list[float]:
-    """Return a first noise scale for every block: its group's median, robust to outliers.
-
-    Blocks that are not scaled have 1.
-    """
-    groups = {b.group for b in blocks if b.scaled}
-    scale = {g: _median_scale([b for b in blocks if b.scaled and b.group == g]) for g in groups}
-    return [scale[b.group] if b.scaled else 1.0 for b in blocks]
-
-
-def freedoms(
-    blocks: Sequence[Block],
-    inliers: Sequence[BoolArray],
-    equations: NormalEquations,
-    covariance: FloatArray,
-) -> list[float]:
-    """Return the residual degrees of freedom of every block."""
-    triples = zip(blocks, inliers, equations.own, strict=True)
-    return [
-        block.values(inside)
-        - float(np.sum(own * covariance[block.columns[:, None], block.columns]))
-        for block, inside, own in triples
-    ]
-
-
-def believed(
+def _believed(
     blocks: Sequence[Block], scales: Sequence[float], largest: Sequence[float]
 ) -> list[BoolArray]:
-    """Return the inliers of every block; `largest` as from `largest_scales`."""
+    """Return the inliers of every block."""
     # Residuals longer than this, in scales, are outliers: 4e-6 of good corners.
     reject = 5.0
     return [
@@ -190,7 +165,7 @@ def believed(
     ]
 
 
-def group_scales(
+def _group_scales(
     blocks: Sequence[Block],
     inliers: Sequence[BoolArray],
     scales: Sequence[float],
@@ -199,8 +174,7 @@ def group_scales(
 ) -> dict[str, float]:
     """Return the typical scale of every group: the median of its blocks' own scales.
 
-    Blocks are weighted by their degrees of freedom. A few bad ones do not count. `largest` as from
-    `largest_scales`.
+    Blocks are weighted by their degrees of freedom. A few bad ones do not count.
     """
     typical = {}
     for group in {b.group for b in blocks if b.scaled}:
@@ -217,7 +191,7 @@ def group_scales(
     return typical
 
 
-def block_scales(
+def _block_scales(
     blocks: Sequence[Block],
     inliers: Sequence[BoolArray],
     scales: Sequence[float],
@@ -225,10 +199,7 @@ def block_scales(
     largest: Sequence[float],
     typical: dict[str, float],
 ) -> list[float]:
-    """Return the scale of every block: from its own residuals, shrunk towards its group's.
-
-    `largest` as from `largest_scales`.
-    """
+    """Return the scale of every block: from its own residuals, shrunk towards its group's."""
     found = []
     # Weight of the group's noise in that of a block, as a number of values.
     group_freedom = 10.0
@@ -244,19 +215,14 @@ def block_scales(
     return found
 
 
-def largest_scales(blocks: Sequence[Block], freedom: Sequence[float]) -> list[float]:
-    """Return the upper limit of every block's scale from the median of its residuals.
+def _largest_scale(block: Block, freedom: float) -> float:
+    """Return the upper limit of a block's scale from the median of its residuals.
 
     Many outliers would raise the scale that accepts them; the limit prevents that. Blocks that are
     not scaled have none.
     """
-    pairs = zip(blocks, freedom, strict=True)
-    return [_largest_scale(block, free) if block.scaled else float("inf") for block, free in pairs]
-
-
-def _largest_scale(block: Block, freedom: float) -> float:
     values = block.values(block.seen)
-    if freedom <= _MIN_FREEDOM or not values:
+    if not block.scaled or freedom <= _MIN_FREEDOM or not values:
         return float("inf")
     # Factor by which the median's scale may be too small by chance.
     doubt = 1.5
@@ -357,17 +323,9 @@ def solve(
 ) -> Solution[State]:
     """Minimise the residuals of a problem, without observations beyond five scales.
 
-    Parameters
-    ----------
-    start : State
-        Initial guess, near enough to the solution for Newton's method.
-    remedy : callable, optional
-        Gives the message, with the remedy, for a parameter that is not determined.
-
-    Raises
-    ------
-    CalibrationError
-        If a parameter is not determined, or nothing can be seen from the start.
+    `start` is near enough to the solution for Newton's method; `remedy` gives the message, with
+    the remedy, for a parameter that is not determined. Raises `CalibrationError` if there is such a
+    parameter, or nothing can be seen from the start.
     """
     max_rounds = 20
     try:
@@ -388,9 +346,8 @@ def solve(
 def inverse(information: FloatArray) -> FloatArray:
     """Invert a positive semidefinite matrix whose units differ by many orders of magnitude.
 
-    Combinations known to rounding only get a variance that is huge, but finite.
-
-    Raises `CalibrationError` if one of the parameters is not determined at all.
+    Combinations known to rounding only get a variance that is huge, but finite. Raises
+    `CalibrationError` if one of the parameters is not determined at all.
     """
     if not len(information):
         return information
@@ -424,7 +381,11 @@ class _Run(Generic[State]):
             raise CalibrationError(
                 "no point can be seen from the starting values; check the rig's lens and dome"
             )
-        self.scales = start_scales(self.blocks)
+        # The median of a group's residuals is robust to outliers.
+        scaled = [b for b in self.blocks if b.scaled]
+        groups = {b.group for b in scaled}
+        scale = {g: _median_scale([b for b in scaled if b.group == g]) for g in groups}
+        self.scales = [scale[b.group] if b.scaled else 1.0 for b in self.blocks]
 
     def descend(self, small_step: float) -> None:
         """Iterate towards the minimum at the present scales and inliers, until steps are small."""
@@ -454,12 +415,17 @@ class _Run(Generic[State]):
         """Estimate noise and outliers anew; return whether that moves the minimum."""
         before = self.scales, self.inliers
         equations = self._equations()
-        freedom = freedoms(self.blocks, self.inliers, equations, inverse(equations.information))
-        largest = largest_scales(self.blocks, freedom)
-        self.inliers = believed(self.blocks, self.scales, largest)
+        covariance = inverse(equations.information)
+        # Residual degrees of freedom of every block.
+        freedom = [
+            b.values(inside) - float(np.sum(own * covariance[b.columns[:, None], b.columns]))
+            for b, inside, own in zip(self.blocks, self.inliers, equations.own, strict=True)
+        ]
+        largest = [_largest_scale(*pair) for pair in zip(self.blocks, freedom, strict=True)]
+        self.inliers = _believed(self.blocks, self.scales, largest)
         now = self.blocks, self.inliers, self.scales, freedom, largest
-        self.typical = group_scales(*now)
-        self.scales = block_scales(*now, self.typical)
+        self.typical = _group_scales(*now)
+        self.scales = _block_scales(*now, self.typical)
         same = all(np.array_equal(a, b) for a, b in zip(before[1], self.inliers, strict=True))
         # Relative change of a noise scale that does not affect the solution.
         same_scale = 5e-3
@@ -483,7 +449,8 @@ class _Run(Generic[State]):
     def _damped_step(self, equations: NormalEquations) -> FloatArray:
         diagonal = np.diag(equations.information)
         damped = equations.information + np.diag(self.damping * diagonal)
-        return _solve(damped, -equations.gradient)
+        size = _sizes(damped)
+        return np.linalg.solve(damped / np.outer(size, size), -equations.gradient / size) / size
 
     def _lower(self, equations: NormalEquations, step: FloatArray, here: float) -> float | None:
         """Take the step, or a shorter one that does not raise the cost; return the cost there.
@@ -516,11 +483,6 @@ class _Run(Generic[State]):
 
     def _equations(self) -> NormalEquations:
         return normal_equations(self.problem.n_parameters, self.blocks, self.inliers, self.scales)
-
-
-def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    size = _sizes(matrix)
-    return np.linalg.solve(matrix / np.outer(size, size), right / size) / size
 
 
 def _sizes(information: FloatArray) -> FloatArray:
