@@ -147,7 +147,7 @@ def test_stripes_on_one_surface_alone_stay_unmatched() -> None:
     for view, first in zip(views, (True, False, False), strict=True):
         chain = view.stripes.chain
         keep = (chain < 2 * n) | (first & (chain == 2 * n + 2))
-        kept.append(replace(view, stripes=view.stripes.where(keep)))
+        kept.append(replace(view, stripes=view.stripes.at(np.flatnonzero(keep))))
     split = assign_lasers(placed(kept, box()), LENS, n_lasers=3)
     assert len(split.planes) == 2
     assert [line.patch for line in split.unmatched] == [2]

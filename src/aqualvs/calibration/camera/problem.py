@@ -10,6 +10,7 @@ corners, so the bend is solved together with them, and only if the views show it
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -85,8 +86,7 @@ class BoardBend:
         return float(np.ptp(off))
 
 
-@dataclass(frozen=True, slots=True)
-class _BentState:
+class _BentState(NamedTuple):
     flat: BundleState
     coefficients: FloatArray
 
@@ -135,8 +135,7 @@ class _BentBundle:
         return replace(self.bundle, views=views)
 
 
-@dataclass(frozen=True, slots=True)
-class BentFit:
+class BentFit(NamedTuple):
     """A bundle solved together with its board's bend."""
 
     bend: BoardBend
@@ -151,16 +150,8 @@ def bend_is_significant(
     """Return whether further terms of a bend exceed the scatter of the views.
 
     From the derivatives at the solution, without solving again: Rao's score, in Wald's test with
-    the covariance by views.
-
-    Parameters
-    ----------
-    bundle : Bundle
-        With points on a flat board, or one bent by terms of lower degree.
-    degree : int
-        Of the terms in question, one of `BEND_DEGREES`.
-    n_solved : int
-        Number of the terms up to that degree that the points include already.
+    the covariance by views. The points include the first `n_solved` of the terms up to `degree`,
+    one of `BEND_DEGREES`, already.
     """
     bend = BoardBend.flat([target.view for target in bundle.views], degree)
     n, n_terms = len(bundle.views), len(bend.exponents) - n_solved
@@ -182,21 +173,9 @@ def bend_is_significant(
 
 
 def fit_bend(flat: Bundle, start: BundleState, degree: int) -> BentFit | None:
-    """Solve a bundle together with a bend that its boards share.
+    """Solve a bundle together with a bend that its boards share; None if no bend helps.
 
-    Parameters
-    ----------
-    flat : Bundle
-        Of views whose poses are free, with the points of the flat board.
-    start : BundleState
-        Initial guess.
-    degree : int
-        Of the polynomial, one of `BEND_DEGREES`.
-
-    Returns
-    -------
-    BentFit or None
-        None where no bend helps to explain the views.
+    `flat` has the points of the flat board, and free poses; `degree` is one of `BEND_DEGREES`.
     """
     bend = BoardBend.flat([target.view for target in flat.views], degree)
     problem = _BentBundle(flat, bend)
@@ -400,17 +379,11 @@ def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bund
 
 
 def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Return the uncertainty (N,) of the pixels of fixed directions, in pixels.
+    """Return the uncertainty (N,), in pixels, of the pixels (N, 2) of fixed directions.
 
-    Parameters
-    ----------
-    covariance : array, shape (P, P)
-        Of its parameters.
-    pixels : array, shape (N, 2)
-        Places; the result is NaN where the lens model does not hold.
+    `covariance` (P, P) is that of the lens's parameters. NaN where the lens model does not hold.
     """
-    directions, _ = lens.directions(pixels)
-    _, _, _, by_number = lens.pixels_with_parameter_jacobian(directions)
+    by_number = lens.pixels_with_parameter_jacobian(lens.directions(pixels)[0])[3]
     spread = np.einsum("nip,pq,niq->ni", by_number, covariance, by_number)
     sigma: FloatArray = np.sqrt(spread.sum(axis=-1))
     return sigma

@@ -79,17 +79,8 @@ def calibrate_lasers(
 ) -> LaserCalibration:
     """Solve the lasers of a rig from pictures of a target that they shine on.
 
-    Parameters
-    ----------
-    rig : Rig
-        Camera, dome and media; its lasers, if any, give names, order and windows.
-    views : sequence of LaserView
-        Corners and stripes of every picture.
-    surfaces : TargetSurfaces
-        Of the target: `box_surfaces` or `board_surface`.
-    options : LaserOptions, optional
-    uncertainty : RigUncertainty, optional
-        Of the camera's numbers; without it they are exact.
+    Lasers of `rig`, if any, give names, order and windows. `surfaces` are those of the target, by
+    `box_surfaces` or `board_surface`. Without an `uncertainty` the camera's numbers are exact.
 
     Raises
     ------
@@ -119,7 +110,7 @@ def calibrate_lasers(
     )
     solved, words = solve_lasers(start, lasers, laser_of, options.loose)
     result = _result_rig(rig, solved, lasers, start.camera_covariance)
-    joint = joint_uncertainty(
+    joint, planes = joint_uncertainty(
         solved.solution,
         solved.problem,
         camera_covariance,
@@ -128,11 +119,11 @@ def calibrate_lasers(
         stripe_bias_px=options.stripe_bias_px,
     )
     each = zip(result.lasers, paper_planes(solved), words, strict=True)
-    figures = [laser_figures(solved, joint, i, *one) for i, one in enumerate(each)]
+    figures = [laser_figures(solved, planes[i], i, *one) for i, one in enumerate(each)]
     pictures = [view_figures(solved, i, view) for i, view in enumerate(solved.views)]
     return LaserCalibration(
         rig=result,
-        uncertainty=joint.uncertainty,
+        uncertainty=joint,
         lasers=tuple(figures),
         views=tuple(pictures),
         left_out=left_out,

@@ -8,6 +8,7 @@ stripe, as it was measured. It depends on the target's pose, the camera's number
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,8 +58,7 @@ class LaserState:
     board_poses: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Distances:
+class _Distances(NamedTuple):
     """Distances of a group's points (N) from their sheet, with derivatives."""
 
     distance: FloatArray
@@ -113,17 +113,11 @@ class LaserProblem:
         blocks += self.bundle.blocks(state.bundle)
         if self.board_pose_prior is not None:
             sigma = self.board_pose_prior.sigmas
-            blocks += [
-                Block(
-                    BOARD_POSES,
-                    self.board_pose_columns(i),
-                    (row / sigma)[None],
-                    np.diag(1.0 / sigma)[None],
-                    RobustLoss.SQUARE,
-                    scaled=False,
-                )
-                for i, row in enumerate(state.board_poses)
-            ]
+            for i, row in enumerate(state.board_poses):
+                columns, off = self.board_pose_columns(i), (row / sigma)[None]
+                slopes = np.diag(1.0 / sigma)[None]
+                square = RobustLoss.SQUARE
+                blocks.append(Block(BOARD_POSES, columns, off, slopes, square, scaled=False))
         return blocks
 
     def moved(self, state: LaserState, step: FloatArray) -> LaserState:
@@ -186,13 +180,8 @@ class LaserProblem:
                 by_water = by_laser[:, sheet.parameter_names.index("n_water")]
             by_air = -by_water * (sheet.n_water / sheet.n_air)
             for i, rows in zip(mine, _rows([self.groups[i] for i in mine]), strict=True):
-                found[i] = _Distances(
-                    distance[rows],
-                    by_point[rows],
-                    by_laser[rows, :N_LASER],
-                    by_water[rows],
-                    by_air[rows],
-                )
+                of_group = (distance, by_point, by_laser[:, :N_LASER], by_water, by_air)
+                found[i] = _Distances(*(values[rows] for values in of_group))
         return [found[i] for i in range(len(self.groups))]
 
     def _stripe_block(self, group: StripeGroup, moves: FloatArray, lit: _Distances) -> Block:

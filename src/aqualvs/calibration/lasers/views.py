@@ -42,21 +42,10 @@ class SpatialPose:
 
 
 def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
-    """Minimise the paper's V (Eq. 32-33).
+    """Minimise the paper's V (Eq. 32-33) from a `dome_from_target` near the solution.
 
-    Parameters
-    ----------
-    camera : Camera
-        Looking into the medium of the picture.
-    view : View
-        Inlier corners; this cost is not robust.
-    start : SE3
-        `dome_from_target` near the solution.
-
-    Raises
-    ------
-    CalibrationError
-        If fewer than three corners have rays (the paper's minimum).
+    The view has inlier corners alone: this cost is not robust. Raises `CalibrationError` if fewer
+    than three corners have rays (the paper's minimum).
     """
     rays = camera.rays(view.pixels)
     n = int(np.count_nonzero(rays.valid))
@@ -120,25 +109,9 @@ def place_views(
 ) -> tuple[list[PlacedView], dict[str, str]]:
     """Find the pose of every picture, and its stripes on the surfaces.
 
-    Parameters
-    ----------
-    camera : Camera
-        Looking into the medium of the pictures.
-    views : sequence of LaserView
-        One for each picture.
-    surfaces : TargetSurfaces
-        Of the target. If it has several, markers must be seen on at least two.
-
-    Returns
-    -------
-    placed : list of PlacedView
-    left_out : dict
-        Names of the pictures that could not be used, with the reason.
-
-    Raises
-    ------
-    CalibrationError
-        If no picture can be used.
+    The camera looks into the medium of the pictures. If the target has several surfaces, markers
+    must be seen on at least two. Returned, too, are the names of the pictures that could not be
+    used, with the reason. Raises `CalibrationError` if no picture can be used.
     """
     found: list[PlacedView] = []
     left_out: dict[str, str] = {}
@@ -150,9 +123,8 @@ def place_views(
             left_out[name] = str(fault).removeprefix(f"{name}: ")
     if not found:
         few = f" (and {len(left_out) - 1} more likewise)" if len(left_out) > 1 else ""
-        reason = next(
-            (f"{name}: {why}" for name, why in left_out.items()), "no pictures were given"
-        )
+        reasons = [f"{name}: {why}" for name, why in left_out.items()]
+        reason = reasons[0] if reasons else "no pictures were given"
         raise CalibrationError(f"no picture can be used: {reason}{few}")
     return found, left_out
 
