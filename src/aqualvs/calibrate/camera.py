@@ -9,7 +9,6 @@ from aqualvs.calibrate.common import (
     N_LASERS,
     WAVELENGTH_NM,
     Calibration,
-    DetectedTargets,
     Nominal,
     Pictures,
     corner_residuals,
@@ -18,6 +17,7 @@ from aqualvs.calibrate.common import (
     detect_boards,
     finish,
     load_nominal,
+    path_text,
     picture_paths,
     summary,
 )
@@ -83,7 +83,12 @@ def calibrate_camera(
     """
     known = load_nominal(Path(nominal)) if isinstance(nominal, str | Path) else nominal or Nominal()
     found = detect_boards(pictures, board)
-    _check_size(found, known, nominal)
+    if known.size_px is not None and known.size_px != found.size_px:
+        (w, h), (nw, nh) = found.size_px, known.size_px
+        raise CalibrationError(
+            f"{found.first}: {w}x{h} px, but {path_text(nominal, 'the nominal rig')} says "
+            f"{nw}x{nh} px; calibrate at the size that the camera is used at, or correct that file"
+        )
     with counting_missed(found):
         result = solve_camera(
             found.views, found.size_px, model=LensModel(model), n_coefficients=n_coefficients
@@ -112,20 +117,9 @@ def run_camera(request: CameraRequest, echo: Echo) -> None:
         model=request.model,
         n_coefficients=request.n_coefficients,
     )
-    result, found = done.solution, done.found[0]
     for line in summary(done):
         echo(line)
-    finish(done.rig, _page(done.rig, result, found, request), request.out, "camera", echo)
-
-
-def _check_size(found: DetectedTargets, nominal: Nominal, source: object) -> None:
-    if nominal.size_px is not None and nominal.size_px != found.size_px:
-        (w, h), (nw, nh) = found.size_px, nominal.size_px
-        where = source if isinstance(source, str | Path) else "the nominal rig"
-        raise CalibrationError(
-            f"{found.first}: {w}x{h} px, but {where} says {nw}x{nh} px; calibrate at "
-            "the size that the camera is used at, or correct that file"
-        )
+    finish(done.rig, _page(done, request), request.out, "camera", echo)
 
 
 def _solved_rig(result: CameraCalibration, nominal: Nominal) -> Rig:
@@ -151,11 +145,9 @@ def _solved_rig(result: CameraCalibration, nominal: Nominal) -> Rig:
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)
 
 
-def _page(
-    rig: Rig, result: CameraCalibration, found: DetectedTargets, request: CameraRequest
-) -> CalibrationPage:
-    sigmas = result.uncertainty.sigmas
-    lens = result.lens
+def _page(done: Calibration[CameraCalibration], request: CameraRequest) -> CalibrationPage:
+    rig, result, found = done.rig, done.solution, done.found[0]
+    sigmas, lens = result.uncertainty.sigmas, result.lens
     cards = [
         Card("residual", f"{result.rms_px:.3f} px", "rms distance of corners"),
         Card(
@@ -166,13 +158,8 @@ def _page(
         Card("pictures", str(len(result.views)), f"{result.n_points:,} corners"),
     ]
     if np.isfinite(result.cross_validation_rms_px):
-        cards.append(
-            Card(
-                "held-out views",
-                f"{result.cross_validation_rms_px:.3f} px",
-                "corners predicted, rms",
-            )
-        )
+        held_px = f"{result.cross_validation_rms_px:.3f} px"
+        cards.append(Card("held-out views", held_px, "corners predicted, rms"))
     return CalibrationPage(
         title="Calibration of the camera",
         subtitle=f"Rig “{rig.name}”",

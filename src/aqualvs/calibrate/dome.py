@@ -71,10 +71,7 @@ class DomeRequest:
     refine_intrinsics: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse negative tolerances, and housings that cannot be.
-
-        Raises `OptionError` naming the option and its value.
-        """
+        """Raise `OptionError` for negative tolerances, and housings that cannot be."""
         _check_length("--inner-radius-mm", self.inner_radius_mm, 1.0, 2000.0)
         _check_length("--port-distance-mm", self.port_distance_mm, 0.1, 2000.0)
         # Zero is an infinitely thin housing.
@@ -197,7 +194,7 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
     )
     for line in summary(done):
         echo(line)
-    finish(done.rig, _page(rig, done, request), request.out, "dome", echo, comments_of=request.rig)
+    finish(done.rig, _page(rig, done, request), request.out, "dome", echo, request.rig)
 
 
 def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
@@ -222,15 +219,11 @@ def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
             # A camera calibrated bare in air goes into the water with its housing.
             rig = rig.in_water(WATER_N)
     numbers = housing.numbers()
-    given = (
-        size if size is None else size / 1e3,
-        thickness if thickness is None else thickness / 1e3,
-        request.n_acrylic,
-    )
     # Radius or distance, thickness and index come first.
-    for name, value in zip(numbers, given, strict=False):
+    given = ((size, 1e3), (thickness, 1e3), (request.n_acrylic, 1.0))
+    for name, (value, per_unit) in zip(numbers, given, strict=False):
         if value is not None:
-            numbers[name] = value
+            numbers[name] = value / per_unit
     return replace(rig, housing=type(housing)(*numbers.values()))
 
 
@@ -242,11 +235,12 @@ def _board_set(
     n_medium: float,
 ) -> tuple[DetectedTargets, BoardSet]:
     """Return the boards found in one set of pictures, and the same as input of the solver."""
-    rows = None if poses is None else load_poses(Path(poses))
+    # Its faults are found before the pictures are searched.
+    rows = () if poses is None else load_poses(Path(poses))
     found = detect_boards(pictures, board)
     check_same_size(rig, found)
     given: tuple[BoardPose | None, ...] = ()
-    if rows is not None and poses is not None:
+    if poses is not None:
         names = [view.name for view in found.views]
         given, notes = match_poses(rows, names, Path(poses), copies=found.copies)
         found = replace(found, pose_notes=notes)
@@ -264,11 +258,9 @@ def _board_set(
 def _solved_rig(rig: Rig, result: DomeCalibration) -> Rig:
     """Return the solved rig with its covariance and a note of this step."""
     uncertainty = merged(rig_uncertainty(rig), result.uncertainty)
-    names = set(rig_uncertainty(rig).names)
     solved = set(parameter_names(rig.camera())) - set(rig.lens.parameter_names)
-    assumed = [
-        file_parameter_name(name) for name in result.uncertainty.names if name not in names | solved
-    ]
+    known = solved | set(rig_uncertainty(rig).names)
+    assumed = [file_parameter_name(n) for n in result.uncertainty.names if n not in known]
     step = SolvedStep(
         pictures=len(result.views),
         points=result.n_points,
@@ -291,14 +283,10 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
     ]
     if result.cross_validation is not None:
         held = result.cross_validation
-        cards.append(
-            Card(
-                "held-out views",
-                f"{held.dome_rms_px:.2f} px",
-                f"a bare lens: {held.bare_rms_px:.2f} px",
-            )
-        )
+        bare = f"a bare lens: {held.bare_rms_px:.2f} px"
+        cards.append(Card("held-out views", f"{held.dome_rms_px:.2f} px", bare))
     port_names = [name for name in rig.camera().params.port.names if name in sigmas]
+    names = [*POSE_PARAMETERS, *port_names, *rig.lens.parameter_names]
     what = "dome" if rig.flat_port is None else "flat port"
     return CalibrationPage(
         title=f"Calibration of the {what}",
@@ -310,12 +298,7 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
         ),
         words=result.findings,
         expectations=expectations(rig),
-        parameters=parameter_rows(
-            rig,
-            result.uncertainty,
-            [*POSE_PARAMETERS, *port_names, *rig.lens.parameter_names],
-            before,
-        ),
+        parameters=parameter_rows(rig, result.uncertainty, names, before),
         residual_maps=(corner_residuals(result.views, rig.size_px),),
         views=corner_rows(result.views, done.left_out),
         facts=facts(

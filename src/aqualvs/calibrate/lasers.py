@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,9 +80,6 @@ from aqualvs.report.html import Card
 from aqualvs.terminal import Echo
 from aqualvs.text import count_text, laser_colour
 
-# Pictures on the page, each with its corners and stripes drawn over it.
-_N_SHOTS = 6
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LasersRequest:
@@ -100,8 +98,7 @@ class LasersRequest:
     wavelength_nm: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Target:
+class _Target(NamedTuple):
     """Target that the lasers shine on."""
 
     name: str  # In messages.
@@ -179,16 +176,18 @@ def calibrate_lasers(
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
     elsewhere = medium is not None or before.is_air(target.n_medium)
-    expected = len(names) if n_lasers is None and names is not None else n_lasers
+    planned = None if before.lasers else before.solved_from.get(N_LASERS)
+    if n_lasers is None and names is not None:
+        n_lasers = len(names)
+    elif n_lasers is None and isinstance(planned, int):
+        n_lasers = planned
     with counting_missed(target.found):
         result = solve_lasers(
             before,
             views,
             target.surfaces,
             options=LaserOptions(
-                n_lasers=_planned_count(before) if expected is None else expected,
-                n_medium=target.n_medium if elsewhere else None,
-                refine=refine,
+                n_lasers=n_lasers, n_medium=target.n_medium if elsewhere else None, refine=refine
             ),
             uncertainty=_camera_uncertainty(before, refine=refine, elsewhere=elsewhere),
         )
@@ -236,7 +235,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_laser_text(figures, laser))
     page = _page(before, done, request)
-    finish(done.rig, page, request.out, "lasers", echo, comments_of=request.rig)
+    finish(done.rig, page, request.out, "lasers", echo, request.rig)
 
 
 def _camera_uncertainty(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:
@@ -250,8 +249,8 @@ def _camera_uncertainty(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncert
     if refine:
         return own
     known = completed_uncertainty(rig)
-    left_out = {"n_water"} - set(own.names) if elsewhere else set()
-    return known.only([name for name in known.names if name not in left_out])
+    left_out = elsewhere and "n_water" not in own.names
+    return known.only([name for name in known.names if not (left_out and name == "n_water")])
 
 
 def _assumed(rig: Rig) -> list[str]:
@@ -295,12 +294,6 @@ def _wavelength(given: float | None, rig: Rig) -> float | None:
     return common_wavelength(rig.lasers)
 
 
-def _planned_count(rig: Rig) -> int | None:
-    """Return the planned number of lasers of a rig without lasers; None otherwise."""
-    planned = rig.solved_from.get(N_LASERS)
-    return planned if isinstance(planned, int) and not rig.lasers else None
-
-
 def _detected(
     pictures: Pictures,
     rig: Rig,
@@ -333,17 +326,16 @@ def _detected(
 
 
 def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> StripePoints:
-    found = find_stripes(
-        read_colour(picture), UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
-    )
+    options = UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
+    found = find_stripes(read_colour(picture), options)
     return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
 
 
 def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
     """Return the solved rig with its covariance and a note of this step."""
     old = rig_uncertainty(before)
-    assumed = [name for name in result.uncertainty.names if ":" not in name]
-    assumed = [file_parameter_name(name) for name in assumed if name not in old.names]
+    new = [name for name in result.uncertainty.names if name not in old.names]
+    assumed = [file_parameter_name(name) for name in new if ":" not in name]
     step = SolvedStep(
         pictures=len(result.views),
         points=sum(figures.n_points for figures in result.lasers),
@@ -412,7 +404,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
     assert target is not None
     used = {one.name for one in result.views}
     seen = zip(done.views, found.pictures, strict=True)
-    shown = (pair for pair in seen if pair[0].view.name in used)
+    shown = (_shot(view, picture) for view, picture in seen if view.view.name in used)
     rows = [
         ViewRow(
             name=one.name,
@@ -425,6 +417,9 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         for one in result.views
     ]
     worst = max(figures.sigma_normal for figures in result.lasers)
+    each = list(zip(result.lasers, rig.lasers, strict=True))
+    # Pictures on the page, each with its corners and stripes drawn over it.
+    n_shots = 6
     return CalibrationPage(
         title="Calibration of the lasers",
         subtitle=f"Rig “{rig.name}”, {target.name}, index outside {done.n_medium:.4f}",
@@ -442,15 +437,9 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             *(f"{name}: {why}" for name, why in result.left_out.items()),
             *found.remarks,
         ),
-        words=tuple(
-            _laser_text(figures, laser)
-            for figures, laser in zip(result.lasers, rig.lasers, strict=True)
-        ),
+        words=tuple(_laser_text(*one) for one in each),
         expectations=expectations(rig),
-        lasers=tuple(
-            _laser_row(figures, laser, before)
-            for figures, laser in zip(result.lasers, rig.lasers, strict=True)
-        ),
+        lasers=tuple(_laser_row(*one, before) for one in each),
         parameters=_refined_rows(before, rig) if result.refined else (),
         residual_maps=(
             residual_map(
@@ -463,7 +452,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         ),
         views=(*rows, *missed_rows(found.missed)),
         # Pictures are not kept in memory: those on the page are read again.
-        pictures=tuple(_shot(view, picture) for view, picture in islice(shown, _N_SHOTS)),
+        pictures=tuple(islice(shown, n_shots)),
         facts=facts(("rig before", str(request.rig)), ("target", str(target))),
     )
 

@@ -77,17 +77,9 @@ def find_stripes(
 ) -> StripePixels:
     """Find laser lines: thin, long, of the lasers' colour, and similar to each other.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width) or (height, width, 3), or Frame
-        Grey, or BGR as OpenCV reads it. In a grey picture every thin bright line counts.
-    options : UncalibratedStripeOptions, optional
-
-    Returns
-    -------
-    StripePixels
-        Each segment is searched along the axis that crosses it at the larger angle. Empty if no
-        segment is certain.
+    The picture is grey (height, width), or BGR as OpenCV reads it (height, width, 3); in a grey one
+    every thin bright line counts. Each segment is searched along the axis that crosses it at the
+    larger angle. Empty if no segment is certain.
     """
     options = options or UncalibratedStripeOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
@@ -115,25 +107,21 @@ def find_stripes(
 def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[StripeSegments]:
     """Find the segments of all lines, laser light or not, one set for each search axis.
 
-    Parameters
-    ----------
-    frame : Frame
-    options : UncalibratedStripeOptions
-        Of these, the wavelength selects the channel in which lines are brightest.
+    Of the options, the wavelength selects the channel in which lines are brightest.
     """
     size_px = frame.luma.shape[1], frame.luma.shape[0]
-    colour = LaserColour.of(options.wavelength_nm)
-    return [find_segments(frame, _whole_band(size_px, axis, colour)) for axis in SearchAxis]
-
-
-def _whole_band(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> LaserBand:
-    """Return a band that covers the whole picture, for slopes up to `_MAX_SLOPE`."""
-    line_px = pixels_per_line(size_px)
-    n_pixels, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
-    n_lines = n_pixels // line_px
-    slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _MAX_SLOPE * line_px)
-    lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
-    return LaserBand(axis, line_px, lowest, highest, -slopes, slopes, colour)
+    colour, line_px = LaserColour.of(options.wavelength_nm), pixels_per_line(size_px)
+    found = []
+    for axis in SearchAxis:
+        # A band that covers the whole picture, for slopes up to `_MAX_SLOPE`.
+        n_pixels, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
+        n_lines = n_pixels // line_px
+        cells = -(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)
+        slopes = np.full(cells, _MAX_SLOPE * line_px)
+        lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
+        band = LaserBand(axis, line_px, lowest, highest, -slopes, slopes, colour)
+        found.append(find_segments(frame, band))
+    return found
 
 
 def _pixels_of(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixels:
@@ -150,7 +138,9 @@ def _pixels_of(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> Stripe
     cosine = 1.0 / np.hypot(1.0, slope)
     pixels = np.stack([line, peaks.position[chain]], axis=-1)
     across = np.stack([-slope * cosine, cosine], axis=-1)
-    width = _unsmoothed(peaks.width[chain], slope * search.line_px) * cosine
+    # Without the broadening by smoothing along slanted stripes.
+    width, added = peaks.width[chain], _WIDTH_OF_SIGMA * SMOOTHING * (slope * search.line_px)
+    width = np.sqrt(np.maximum(width**2 - added**2, (0.5 * width) ** 2)) * cosine
     return StripePixels(
         pixels[:, ::-1] if along_x else pixels,
         across[:, ::-1] if along_x else across,
@@ -174,13 +164,6 @@ def _in_dot(width: FloatArray, line_px: int) -> BoolArray:
         if line_px * (end - first) > longest_dot * np.median(width[first:end]):
             wide[first:end] = False
     return wide
-
-
-def _unsmoothed(width: FloatArray, slope: FloatArray) -> FloatArray:
-    """Return widths (N,), in pixels, without the broadening by smoothing along slanted stripes."""
-    added = _WIDTH_OF_SIGMA * SMOOTHING * slope
-    squared: FloatArray = np.maximum(width**2 - added**2, (0.5 * width) ** 2)
-    return np.sqrt(squared)
 
 
 def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:
@@ -300,6 +283,9 @@ def continued(
 ) -> IntArray:
     """Find the segments of lines: long and likely ones, and others that continue these.
 
+    Returns the number (P,) of the line that each segment belongs to, or -1. A line may have
+    segments of both search axes.
+
     Parameters
     ----------
     found : list of StripeSegments
@@ -310,12 +296,6 @@ def continued(
         Log odds and length from which on a segment is a line by itself.
     size_px : tuple of int
         Width and height of the picture.
-
-    Returns
-    -------
-    line : int array, shape (P,)
-        Number of the line that a segment belongs to, or -1. A line may have segments of both search
-        axes.
     """
     length = np.concatenate([segments.table[LENGTH] for segments in found])
     pool = np.flatnonzero(log_odds >= least - _MAX_SHORTFALL)
@@ -455,24 +435,13 @@ def _fit_ends(line: FloatArray, position: FloatArray, ends: _Ends, i: int) -> No
 def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
     """Return the chains of peaks of some segments, extended by the peaks beyond their ends.
 
-    A segment ends at a kink or a gap; a few peaks beyond may still belong to the line.
-
-    Parameters
-    ----------
-    segments : StripeSegments
-    keep : bool array, shape (P,)
-        True for the segments that are lines.
-
-    Returns
-    -------
-    chains : list of int array
-        Indices of peaks along each segment.
+    A segment ends at a kink or a gap; a few peaks beyond may still belong to the line. `keep` (P,)
+    marks the segments that are lines; chains are indices of peaks along each.
     """
     peaks = segments.peaks
     first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))
-    chains = [
-        segments.order[segments.start[k] : segments.start[k + 1]] for k in np.flatnonzero(keep)
-    ]
+    bounds = zip(segments.start[:-1][keep], segments.start[1:][keep], strict=True)
+    chains = [segments.order[start:end] for start, end in bounds]
     used = np.zeros(peaks.n, bool)
     for chain in chains:
         used[chain] = True

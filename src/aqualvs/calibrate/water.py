@@ -2,7 +2,7 @@
 
 import glob
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,10 +58,7 @@ class WaterRequest:
     turn_sigma_deg: float
 
     def __post_init__(self) -> None:
-        """Refuse negative deviations.
-
-        Raises `OptionError` naming the option and its value.
-        """
+        """Raise `OptionError` for negative deviations."""
         check_options(self, "place_sigma_mm", "turn_sigma_deg", least=0.0, wanted="0 or more")
 
 
@@ -120,7 +117,14 @@ def calibrate_water(
         prior=prior,
         options=options or IndexOptions(),
     )
-    _check_observable(result)
+    if not result.observable and not any(reading.prior_used for reading in result.readings):
+        why = "; ".join(result.remarks) or (
+            "the lens is too near the centre of the dome; give temperature and salinity"
+        )
+        raise CalibrationError(
+            f"the index is known to {result.sigma:.2g} only: {why}; see --temperature-c "
+            "and --salinity"
+        )
     return Calibration(
         rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,
@@ -155,7 +159,7 @@ def run_water(request: WaterRequest, echo: Echo) -> None:
     for line in done.notes:
         echo(line)
     page = _page(done.rig, result, prior, request)
-    finish(done.rig, page, request.out, "water", echo, comments_of=request.rig)
+    finish(done.rig, page, request.out, "water", echo, request.rig)
 
 
 def _found_in(
@@ -177,22 +181,10 @@ def _found_in(
             tick(1)
     if not views:
         raise CalibrationError(
-            f"{target if isinstance(target, str | Path) else name}: its markers are in no picture "
+            f"{path_text(target, 'the target')}: its markers are in no picture "
             f"of {source.name}; check its family and ids, and that the camera sees the target sharp"
         )
     return DetectedTargets(tuple(views), (), rig.size_px, missed), times
-
-
-def _check_observable(result: WaterCalibration) -> None:
-    """Raise `CalibrationError` if neither the pictures nor a prior determine the index."""
-    if not result.observable and not any(reading.prior_used for reading in result.readings):
-        why = "; ".join(result.remarks) or (
-            "the lens is too near the centre of the dome; give temperature and salinity"
-        )
-        raise CalibrationError(
-            f"the index is known to {result.sigma:.2g} only: {why}; see --temperature-c "
-            "and --salinity"
-        )
 
 
 def _source(request: WaterRequest) -> FrameSource:
@@ -224,43 +216,38 @@ def _page(
 ) -> CalibrationPage:
     counted = [reading for reading in result.readings if reading]
     times = np.array([reading.time for reading in counted])
+    random = f"{result.sigma_random:.1e}"
     marks = tuple((step.time, f"{step.size:+.4f}") for step in result.steps)
     level = None if prior is None else (prior.source, prior.n)
+    course = Series(
+        title="Index of each picture, with its own noise",
+        x_label="time, s",
+        y_label="index",
+        x=times,
+        y=np.array([reading.n_frame for reading in counted]),
+        sigma=np.array([reading.sigma_frame for reading in counted]),
+        marks=marks,
+    )
     return CalibrationPage(
         title="Calibration of the water",
         subtitle=f"Rig “{rig.name}”, {' '.join(request.source[:3])}",
         cards=(
             Card("index", f"{result.n:.5f}", f"± {result.sigma:.5f}"),
-            Card(
-                "random part",
-                f"{result.sigma_random:.1e}",
-                "of this sigma; less with more pictures",
-            ),
+            Card("random part", random, "of this sigma; less with more pictures"),
             Card("pictures", str(len(counted)), f"{result.rms_px:.3f} px rms"),
         ),
         warnings=tuple(step.text() for step in result.steps),
         words=result.remarks,
         expectations=expectations(rig),
         series=(
-            Series(
+            replace(
+                course,
                 title="Index, from all pictures so far",
-                x_label="time, s",
-                y_label="index",
-                x=times,
                 y=np.array([reading.n for reading in counted]),
                 sigma=np.array([reading.sigma for reading in counted]),
                 level=level,
-                marks=marks,
             ),
-            Series(
-                title="Index of each picture, with its own noise",
-                x_label="time, s",
-                y_label="index",
-                x=times,
-                y=np.array([reading.n_frame for reading in counted]),
-                sigma=np.array([reading.sigma_frame for reading in counted]),
-                marks=marks,
-            ),
+            course,
         ),
         views=missed_rows({one.name: one.refused for one in result.readings if not one}),
         facts=facts(("rig before", str(request.rig)), ("target", str(request.target))),
