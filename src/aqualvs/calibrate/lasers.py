@@ -67,7 +67,6 @@ from aqualvs.report.calibration_material import (
     CalibrationPage,
     LaserRow,
     Overlay,
-    ParameterRow,
     PictureShot,
     ViewRow,
     expectations,
@@ -417,6 +416,8 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         for one in result.views
     ]
     worst = max(figures.sigma_normal for figures in result.lasers)
+    known = rig_uncertainty(rig)
+    refined = [name for name in known.names if ":" not in name]
     each = list(zip(result.lasers, rig.lasers, strict=True))
     # Pictures on the page, each with its corners and stripes drawn over it.
     n_shots = 6
@@ -440,7 +441,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         words=tuple(_laser_text(*one) for one in each),
         expectations=expectations(rig),
         lasers=tuple(_laser_row(*one, before) for one in each),
-        parameters=_refined_rows(before, rig) if result.refined else (),
+        parameters=parameter_rows(rig, known, refined, before) if result.refined else (),
         residual_maps=(
             residual_map(
                 "Corners of the target",
@@ -455,12 +456,6 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         pictures=tuple(islice(shown, n_shots)),
         facts=facts(("rig before", str(request.rig)), ("target", str(target))),
     )
-
-
-def _refined_rows(before: Rig, rig: Rig) -> tuple[ParameterRow, ...]:
-    uncertainty = rig_uncertainty(rig)
-    names = [name for name in uncertainty.names if ":" not in name]
-    return parameter_rows(rig, uncertainty, names, before)
 
 
 def _corners_of(name: str, pixels: FloatArray) -> View:

@@ -223,8 +223,12 @@ def with_supported_coefficients(
     steps = _STEPS[solution.state.rig.lens.model]
     if len(solution.state.rig.lens.distortion) != steps[0]:
         bundle, solution = with_coefficients(bundle, solution, steps[0])
-    if solution.state.rig.lens.model is LensModel.OPENCV and not _distorts(bundle, solution):
-        return with_coefficients(bundle, solution, 0)
+    lens = solution.state.rig.lens
+    if lens.model is LensModel.OPENCV:
+        columns, values = np.arange(4, 4 + len(lens.distortion)), np.array(lens.distortion)
+        squares = values @ np.linalg.solve(solution.covariance[np.ix_(columns, columns)], values)
+        if not squares > _price(bundle, solution, 0):
+            return with_coefficients(bundle, solution, 0)
     for n in steps[1:]:
         if gain_of_coefficients(bundle, solution, n) < _price(bundle, solution, n):
             break
@@ -264,14 +268,6 @@ def gain_of_coefficients(bundle: Bundle, solution: Solution[BundleState], n: int
     known = values > redundant
     along = (vectors.T @ (slope / size))[known]
     return float(np.sum(along**2 / values[known]))
-
-
-def _distorts(bundle: Bundle, solution: Solution[BundleState]) -> bool:
-    lens = solution.state.rig.lens
-    columns = np.arange(4, 4 + len(lens.distortion))
-    values = np.array(lens.distortion)
-    squares = values @ np.linalg.solve(solution.covariance[np.ix_(columns, columns)], values)
-    return bool(squares > _price(bundle, solution, 0))
 
 
 def _price(bundle: Bundle, solution: Solution[BundleState], n: int) -> float:

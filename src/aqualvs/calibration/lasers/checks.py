@@ -273,12 +273,6 @@ def _apart(a: Plane, b: Plane) -> float:
     return float(np.hypot(angle, (a.offset - b.offset) / far_offset))
 
 
-# Ratio of the corners' residuals with stripes to those without from which they contradict each
-# other; ratio of the stripes' residuals from a plane to those from lines from which they do.
-_CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
-_MIN_BINS = 5
-
-
 def check_size(views: Sequence[LaserView]) -> None:
     """Raise `CalibrationError` for targets whose size indicates a wrong unit."""
     points = [v.view.points for v in views if len(v.view)]
@@ -445,20 +439,27 @@ def contradicts(solved: SolvedLasers) -> bool:
     Then stripes shift the board from its pose by corners alone, or stripes do not fit one plane
     although each is straight.
     """
+    # Ratio of the corners' residuals with stripes to those without from which they contradict each
+    # other; ratio of the stripes' residuals from a plane to those from lines from which they do.
+    corners_contradict, stripes_contradict = 1.5, 3.0
+    n_groups = len(solved.problem.groups)
+    blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
+    squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
+    corners_px = float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
     alone_px = float(np.sqrt(np.mean([view.rms_px**2 for view in solved.views])))
     return (
-        _corners_px(solved) / alone_px > _CORNERS_CONTRADICT
-        or _stripes_misfit(solved) > _STRIPES_CONTRADICT
+        corners_px / alone_px > corners_contradict or _stripes_misfit(solved) > stripes_contradict
     )
 
 
 def _stripes_misfit(solved: SolvedLasers) -> float:
     """Return the ratio of the stripes' residuals from their plane to those from straight lines."""
     from_plane = from_line = 0.0
+    min_bins = 5
     for i, group in enumerate(solved.problem.groups):
         residuals, _ = solved.stripe_residuals_px(i)
         seen = np.isfinite(residuals)
-        if np.count_nonzero(seen) < _MIN_BINS:
+        if np.count_nonzero(seen) < min_bins:
             continue
         weights = 1.0 / group.sigma_px[seen]
         way = way_along(group.pixels[seen])
@@ -480,13 +481,6 @@ def loose_text(solved: SolvedLasers) -> str:
         f"because stripes and corners contradict each other; by {tilt:.1f} deg and {offset:.1f} mm "
         "(rms). Fix a flat board to a flat wall for better lasers"
     )
-
-
-def _corners_px(solved: SolvedLasers) -> float:
-    n_groups = len(solved.problem.groups)
-    blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
-    squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
-    return float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
 
 
 def _too_few(

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aqualvs.calibration.lasers.problem import N_LASER, LaserProblem, LaserState
-from aqualvs.calibration.lasers.stripes_on_planes import StripeGroup, correlation_factor
-from aqualvs.calibration.solver.least_squares import Block, Solution, inverse, normal_equations
+from aqualvs.calibration.lasers.stripes_on_planes import correlation_factor
+from aqualvs.calibration.solver.least_squares import Solution, inverse, normal_equations
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.camera import parameter_names
 from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty
@@ -180,22 +180,18 @@ def _data_information(
     n_surfaces = len(problem.surfaces.planes)
     for i, group in enumerate(problem.groups):
         scales[i] *= float(np.sqrt(correlation[group.laser]))
+        # One more unknown for each surface: a shift of the stripe across, in pixels.
         first = full.n_parameters + n_surfaces * group.laser
-        taken[i] = _with_bias(taken[i], group, np.arange(first, first + n_surfaces))
+        by_bias = np.zeros((len(group), 1, n_surfaces))
+        by_bias[np.arange(len(group)), 0, group.surface] = 1.0 / group.sigma_px
+        taken[i] = replace(
+            taken[i],
+            columns=np.concatenate([taken[i].columns, np.arange(first, first + n_surfaces)]),
+            jacobian=np.concatenate([taken[i].jacobian, by_bias], axis=2),
+        )
     inliers = [solution.inliers[i] for i in then]
     n_all = full.n_parameters + n_surfaces * problem.n_lasers
     return normal_equations(n_all, taken, inliers, scales).information
-
-
-def _with_bias(block: Block, group: StripeGroup, columns: IntArray) -> Block:
-    """Return a stripe's block with one more unknown for each surface: a shift across, in pixels."""
-    by_bias = np.zeros((len(group), 1, len(columns)))
-    by_bias[np.arange(len(group)), 0, group.surface] = 1.0 / group.sigma_px
-    return replace(
-        block,
-        columns=np.concatenate([block.columns, columns]),
-        jacobian=np.concatenate([block.jacobian, by_bias], axis=2),
-    )
 
 
 def _consider_covariance(

@@ -23,7 +23,7 @@ from aqualvs.calibration.lasers.candidates import (
     ordered_candidates,
     plane_residuals_px,
 )
-from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledStripes
+from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
@@ -73,7 +73,10 @@ def judged(
     `candidates`: the best first. `lens_in_dome`, shape (3,): the lens's projection centre.
     """
     pooled = table.pooled
-    n_sure = _n_sure(np.array([c.log_false_alarms for c in candidates]))
+    # The best planes within the allowed false discovery rate.
+    alarms = np.sort([c.log_false_alarms for c in candidates])
+    allowed = _SURE.false_share * np.arange(1, len(alarms) + 1)
+    n_sure = int(np.flatnonzero(np.exp(alarms) <= allowed).max(initial=-1)) + 1
     stay = _stay_in_picture(pooled, candidates, lens_in_dome)
     # Planes with light on the target are judged before those beside it.
     beside = [float(np.mean(pooled.on_target[c.members])) < 1.0 - _SURE.most for c in candidates]
@@ -88,13 +91,6 @@ def judged(
         seen.append(JudgedPlane(candidates[i], patches, *(fault or (PlaneVerdict.LASER, ""))))
     ranks = list(PlaneVerdict)
     return sorted(seen, key=lambda j: (ranks.index(j.verdict), j.candidate.log_false_alarms))
-
-
-def _n_sure(log_alarms: FloatArray) -> int:
-    """Return the number of best planes within the allowed false discovery rate."""
-    allowed = _SURE.false_share * np.arange(1, len(log_alarms) + 1)
-    good = np.flatnonzero(np.exp(np.sort(log_alarms)) <= allowed)
-    return int(good[-1]) + 1 if len(good) else 0
 
 
 def _fault(
@@ -287,22 +283,10 @@ def assign_lasers(
 ) -> LaserAssignment:
     """Assign stripe points to the laser planes that they lie in.
 
-    Parameters
-    ----------
-    pooled : PooledStripes
-        Points of all views.
-    lens_in_dome : array, shape (3,)
-        The lens's projection centre; a plane through it is no laser.
-    n_lasers : int, optional
-        Number of lasers that shine; by default all planes with clear evidence.
-    tolerance_px : float
-        Greatest distance of a stripe from its plane.
-
-    Returns
-    -------
-    LaserAssignment
-        All planes with clear evidence, even more than `n_lasers`. If there are fewer, also the best
-        undecided ones, if they are clearly better than the other undecided ones.
+    The lasers are all planes with clear evidence, even more than `n_lasers`, the number that shine.
+    If there are fewer, they are also the best undecided ones, if these are clearly better than the
+    other undecided ones. A plane through the lens's projection centre, `lens_in_dome` (3,), is no
+    laser. `tolerance_px` is the greatest distance of a stripe from its plane.
     """
     lines = _all_lines(pooled)
     table = LineTable.of(pooled, lines, tolerance_px)
@@ -315,7 +299,15 @@ def assign_lasers(
     in_planes = {int(i) for plane in found for i in plane.candidate.lines}
     lonely = [len(line.members) for i, line in enumerate(lines) if i not in in_planes]
     longest = max(lonely, default=0)
-    perhaps = [plane for plane in found if _may_be_laser(plane, lines, longest)]
+    # Planes that can be lasers if more are known to shine: not if a much longer stripe is in no
+    # plane, as that may be the laser then, seen on one surface only.
+    perhaps = [
+        plane
+        for plane in found
+        if plane.verdict in (PlaneVerdict.WEAK, PlaneVerdict.DOUBTFUL)
+        and plane.candidate.log_false_alarms <= _TOLD
+        and longest <= _LONGER * max(len(lines[int(i)].members) for i in plane.candidate.lines)
+    ]
     missing = 0 if n_lasers is None else max(n_lasers - len(taken), 0)
     if 0 < missing <= len(perhaps):
         best, rest = perhaps[:missing], perhaps[missing:]
@@ -324,18 +316,14 @@ def assign_lasers(
     planes = _refined(pooled, [plane.candidate.plane for plane in taken], tolerance_px)
     laser = assigned(pooled, planes, tolerance_px)
     spare = tuple(plane for plane in found if plane not in taken)
-    return LaserAssignment(tuple(planes), laser, _unmatched(lines, laser), spare)
-
-
-def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int) -> bool:
-    """Return whether a plane can be a laser if more are known to shine.
-
-    Not if a much longer stripe, of `longest` points, is in no plane: that may be the laser then,
-    seen on one surface only.
-    """
-    perhaps = plane.verdict in (PlaneVerdict.WEAK, PlaneVerdict.DOUBTFUL)
-    own = max(len(lines[int(i)].members) for i in plane.candidate.lines)
-    return perhaps and plane.candidate.log_false_alarms <= _TOLD and longest <= _LONGER * own
+    # Lines with hardly any point assigned to a laser.
+    unmatched = [
+        line
+        for line in lines
+        if len(line.members) >= _SURE.min_points and np.mean(laser[line.members] >= 0) < 0.2
+    ]
+    unmatched.sort(key=lambda line: -len(line.members))
+    return LaserAssignment(tuple(planes), laser, tuple(unmatched), spare)
 
 
 def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
@@ -347,35 +335,20 @@ def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
 
 
 def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
-    lines = []
-    n_of_chain = _counts_on_patch(pooled)
+    # Number of points of each point's chain on its surface.
+    key = pooled.patch * (int(pooled.chain.max(initial=-1)) + 1) + pooled.chain
+    _, place, counts = np.unique(key, return_inverse=True, return_counts=True)
+    n_of_chain = counts[place]
     # Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
     min_of_chain = 0.25
+    lines = []
     for patch in range(len(pooled.patch_planes)):
-        members = np.flatnonzero(pooled.patch == patch)
-        lines += [
-            line
-            for line in lines_on_patch(pooled, members, patch)
-            if _share_of_chains(pooled, line, n_of_chain) >= min_of_chain
-        ]
+        for line in lines_on_patch(pooled, np.flatnonzero(pooled.patch == patch), patch):
+            chains, at = np.unique(pooled.chain[line.members], return_inverse=True)
+            mine = np.bincount(at, minlength=len(chains))[at]
+            if np.mean(mine / n_of_chain[line.members]) >= min_of_chain:
+                lines.append(line)
     return lines
-
-
-def _counts_on_patch(pooled: PooledStripes) -> IntArray:
-    """Return for each point (N,) the number of points of its chain on its surface."""
-    n_chains = int(pooled.chain.max(initial=-1)) + 1
-    _, place, counts = np.unique(
-        pooled.patch * n_chains + pooled.chain, return_inverse=True, return_counts=True
-    )
-    n_of_chain: IntArray = counts[place]
-    return n_of_chain
-
-
-def _share_of_chains(pooled: PooledStripes, line: StripeLine, n_of_chain: IntArray) -> float:
-    """Return the share of its chains' points that a line holds, as the mean over its points."""
-    chains, place = np.unique(pooled.chain[line.members], return_inverse=True)
-    mine = np.bincount(place, minlength=len(chains))[place]
-    return float(np.mean(mine / n_of_chain[line.members]))
 
 
 def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) -> list[Plane]:
@@ -401,25 +374,12 @@ def assigned(
     residuals = np.abs(plane_residuals_px(pooled.placed, planes))
     nearest = np.argmin(residuals, axis=1)
     clear = residuals[np.arange(n), nearest] <= tolerance_px
-    clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _SURE.crossing_px, axis=1) <= 1
-    return np.where(clear, nearest, -1)
-
-
-def _crossed_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
-    """Return distances (N, L) of points from the planes' cuts with their surface, in pixels."""
-    normals = np.array([p.normal for p in planes])
+    # Distances (N, L) of points from the planes' cuts with their surface.
+    placed, normals = pooled.placed, np.array([p.normal for p in planes])
     offsets = np.array([p.offset for p in planes])
     gain = np.hypot(placed.by_across @ normals.T, placed.by_along @ normals.T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance: FloatArray = np.abs(placed.points_in_dome @ normals.T - offsets) / gain
-    return np.nan_to_num(distance, nan=np.inf)
-
-
-def _unmatched(lines: Sequence[StripeLine], laser: IntArray) -> tuple[StripeLine, ...]:
-    """Return lines with hardly any point assigned to a laser."""
-    free = [
-        line
-        for line in lines
-        if len(line.members) >= _SURE.min_points and np.mean(laser[line.members] >= 0) < 0.2
-    ]
-    return tuple(sorted(free, key=lambda line: -len(line.members)))
+        crossed_px = np.abs(placed.points_in_dome @ normals.T - offsets) / gain
+    # NaN compares false.
+    clear &= np.count_nonzero(crossed_px <= _SURE.crossing_px, axis=1) <= 1
+    return np.where(clear, nearest, -1)

@@ -140,7 +140,13 @@ def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces
     pose = target_pose(camera, view)
     believed = view.where(pose.inliers)
     if len(surfaces.planes) > 1:
-        _check_surfaces(believed, surfaces)
+        seen = planes_with_points(believed, surfaces.planes)
+        if len(seen) < 2:
+            where = f"plane '{surfaces.names[seen[0]]}' only" if seen else "none of the planes"
+            raise CalibrationError(
+                f"{view.name}: markers are seen on {where}; turn the vehicle so that markers on "
+                "two planes of the box are in the picture"
+            )
     elif pose.ambiguous:
         raise CalibrationError(
             f"{view.name}: the board could lean either way; take this picture from nearer, or "
@@ -164,16 +170,6 @@ def replaced(camera: Camera, view: PlacedView, pose: SE3, surfaces: TargetSurfac
     """Return the picture with another pose, and its stripes placed by that pose."""
     placed = place_stripes(camera, view.stripes, pose, surfaces)
     return replace(view, dome_from_target=pose, placed=placed)
-
-
-def _check_surfaces(view: View, surfaces: TargetSurfaces) -> None:
-    seen = planes_with_points(view, surfaces.planes)
-    if len(seen) < 2:
-        where = f"plane '{surfaces.names[seen[0]]}' only" if seen else "none of the planes"
-        raise CalibrationError(
-            f"{view.name}: markers are seen on {where}; turn the vehicle so that markers on two "
-            "planes of the box are in the picture"
-        )
 
 
 def pooled(views: Sequence[PlacedView], surfaces: TargetSurfaces) -> PooledStripes:

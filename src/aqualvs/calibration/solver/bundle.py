@@ -64,7 +64,9 @@ class SquareBoard:
         """Return the tilt of the board (about x and z), and its roll (about y)."""
         del centre
         off_square = dome_from_target.rotation @ self.square.T
-        tilt = tilt_of(off_square)
+        # The axis of the rotation times the sine of its angle.
+        r = off_square
+        tilt = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
         by_turn = 0.5 * (np.trace(off_square) * np.eye(3) - off_square)
 
         def block(group: str, axes: list[int], sigma: float) -> Block:
@@ -73,15 +75,6 @@ class SquareBoard:
             return Block(group, columns[:3], off, slopes, RobustLoss.CAUCHY, scaled=False)
 
         return [block(TILTS, [0, 2], self.board_tilt_sigma), block(ROLLS, [1], self.roll_sigma)]
-
-
-def tilt_of(off_square: FloatArray) -> FloatArray:
-    """Return the axis of a rotation (..., 3, 3) times the sine of its angle, shape (..., 3)."""
-    r = off_square
-    return 0.5 * np.stack(
-        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
-        axis=-1,
-    )
 
 
 def plane_distance(dome_from_target: SE3) -> float:
@@ -96,47 +89,12 @@ PRIORS = "priors"
 _ROTATION = POSE_PARAMETERS[3:]
 
 
-def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty) -> list[Block]:
-    """Return the deviation of a rig from its prior, in sigmas.
-
-    The prior has the mean `start` and the uncertainty `priors`; numbers that it does not name have
-    none. `free` are the numbers of the columns 0, 1, ... of the solve.
-    """
-    known = [name for name in free if name in priors.names]
-    if not known:
-        return []
-    columns = np.array([free.index(name) for name in known])
-    return [_prior(columns, rig_difference(start, rig, known), _whiten(priors.of(known)))]
-
-
-def media_prior(
-    start: FloatArray, media: FloatArray, sigma: FloatArray, columns: IntArray
-) -> list[Block]:
-    """Return the deviation of the indices (M,) of free media from their priors, in sigmas.
-
-    The priors have means `start` and standard deviations `sigma` (M,), infinite where there is no
-    prior.
-    """
-    bounded = np.isfinite(sigma)
-    if not bounded.any():
-        return []
-    moved = (media - start)[bounded]
-    return [_prior(columns[bounded], moved, np.diag(1.0 / sigma[bounded]))]
-
-
 def rig_difference(start: Rig, rig: Rig, names: Sequence[str]) -> FloatArray:
     """Return the step (P,) of `rig_moved_by` that leads from `start` to `rig`, by named numbers."""
     a, b = rig_numbers(start), rig_numbers(rig)
     turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ start.dome_from_cam.rotation.T)
     rotation = dict(zip(_ROTATION, turn, strict=True))
     return np.array([rotation[n] if n in rotation else b[n] - a[n] for n in names])
-
-
-def _whiten(covariance: FloatArray) -> FloatArray:
-    """Return W with W.T @ W the inverse of a covariance, whatever its units."""
-    sigma = np.sqrt(np.diag(covariance))
-    lower = np.linalg.cholesky(covariance / np.outer(sigma, sigma))
-    return np.linalg.inv(lower) / sigma
 
 
 def _prior(columns: IntArray, moved: FloatArray, whiten: FloatArray) -> Block:
@@ -322,10 +280,21 @@ class Bundle:
         ]
 
     def _priors(self, state: BundleState) -> list[Block]:
-        media, free = self.free_media, self.free
-        return rig_prior(self.start.rig, state.rig, free, self.priors) + media_prior(
-            self.start.media[media],
-            state.media[media],
-            self.media_sigma[media],
-            np.arange(len(free), self.n_shared),
-        )
+        """Return the deviations of the rig and of media from their priors, in sigmas."""
+        blocks = []
+        known = [name for name in self.free if name in self.priors.names]
+        if known:
+            columns = np.array([self.free.index(name) for name in known])
+            covariance = self.priors.of(known)
+            sigma = np.sqrt(np.diag(covariance))
+            # whiten.T @ whiten is the inverse of the covariance, whatever its units.
+            lower = np.linalg.cholesky(covariance / np.outer(sigma, sigma))
+            whiten = np.linalg.inv(lower) / sigma
+            moved = rig_difference(self.start.rig, state.rig, known)
+            blocks.append(_prior(columns, moved, whiten))
+        bounded = [i for i in self.free_media if np.isfinite(self.media_sigma[i])]
+        if bounded:
+            columns = np.concatenate([self.medium_columns(i) for i in bounded])
+            moved = state.media[bounded] - self.start.media[bounded]
+            blocks.append(_prior(columns, moved, np.diag(1.0 / self.media_sigma[bounded])))
+        return blocks

@@ -109,24 +109,19 @@ def normal_equations(
     information, gradient = np.zeros((n_parameters, n_parameters)), np.zeros(n_parameters)
     own = []
     for block, inside, scale in zip(blocks, inliers, scales, strict=True):
-        matrix, vector = _of_block(block, inside, scale)
-        information[block.columns[:, None], block.columns] += matrix
-        gradient[block.columns] += vector
-        own.append(matrix)
+        weights = block.loss.weight(block.lengths / scale)
+        # A point that a step made invisible has no derivative.
+        believed = inside & np.isfinite(weights)
+        residuals, jacobian = block.residuals, block.jacobian
+        if not believed.all():
+            weights, residuals = weights[believed], residuals[believed]
+            jacobian = jacobian[believed]
+        root = np.repeat(np.sqrt(weights) / scale, residuals.shape[1])
+        slopes = jacobian.reshape(-1, len(block.columns)) * root[:, None]
+        own.append(slopes.T @ slopes)
+        information[block.columns[:, None], block.columns] += own[-1]
+        gradient[block.columns] += slopes.T @ (residuals.reshape(-1) * root)
     return NormalEquations(information, gradient, tuple(own))
-
-
-def _of_block(block: Block, inside: BoolArray, scale: float) -> tuple[FloatArray, FloatArray]:
-    n_values, n_columns = block.residuals.shape[1], len(block.columns)
-    weights = block.loss.weight(block.lengths / scale)
-    # A point that a step made invisible has no derivative.
-    believed = inside & np.isfinite(weights)
-    residuals, jacobian = block.residuals, block.jacobian
-    if not believed.all():
-        weights, residuals, jacobian = weights[believed], residuals[believed], jacobian[believed]
-    root = np.repeat(np.sqrt(weights) / scale, n_values)
-    slopes = jacobian.reshape(-1, n_columns) * root[:, None]
-    return slopes.T @ slopes, slopes.T @ (residuals.reshape(-1) * root)
 
 
 def cost(
