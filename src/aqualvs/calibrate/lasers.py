@@ -32,12 +32,7 @@ from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures
-from aqualvs.calibration.lasers.stripes_on_planes import (
-    StripePoints,
-    TargetSurfaces,
-    board_surface,
-    box_surfaces,
-)
+from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, board_surface, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet, View
@@ -170,8 +165,9 @@ def calibrate_lasers(
     wavelength_nm = _wavelength(wavelength_nm, before)
     target = _detected(pictures, before, box, board, medium, board_offset)
     check_same_size(before, target.found)
+    options = UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
     views = tuple(
-        LaserView(view, _stripes(picture, view.name, wavelength_nm))
+        LaserView(view, find_stripes(read_colour(picture), options))
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
     elsewhere = medium is not None or before.is_air(target.n_medium)
@@ -322,12 +318,6 @@ def _detected(
     n_medium = medium_index(medium, rig, rig.n_water)
     surface = board_surface(thickness=board_offset)
     return _Target(named(board, "the board"), surface, found, n_medium)
-
-
-def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> StripePoints:
-    options = UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
-    found = find_stripes(read_colour(picture), options)
-    return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
 
 
 def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:

@@ -12,12 +12,13 @@ Alignments"). Only detected peaks are added, and no line begins without a certai
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from aqualvs.calibration.lasers.stripes_on_planes import StripePoints
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, pixels_per_line
@@ -57,19 +58,11 @@ class UncalibratedStripeOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class StripePixels:
+class StripePixels(StripePoints):
     """Points on stripes of a picture, N of them, ordered along each unbroken chain."""
 
-    pixels: FloatArray  # Shape (N, 2): sub-pixel centres, in `image`.
-    across: FloatArray  # Shape (N, 2): unit vectors perpendicular to the stripe, in `image`.
-    chain: IntArray  # Shape (N,): number of the unbroken chain that a point belongs to.
     height: FloatArray  # Shape (N,): peak above background, in grey levels.
     width: FloatArray  # Shape (N,): full width at half height across the stripe, in pixels.
-    sigma_px: FloatArray  # Shape (N,): nominal standard deviation of the centre across the stripe.
-
-    def __len__(self) -> int:
-        """Return the number of points."""
-        return len(self.chain)
 
 
 def find_stripes(
@@ -145,9 +138,9 @@ def _pixels_of(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> Stripe
         pixels[:, ::-1] if along_x else pixels,
         across[:, ::-1] if along_x else across,
         np.zeros(len(chain), np.int64),
+        np.zeros(len(chain)),
         peaks.height[chain],
         width,
-        np.zeros(len(chain)),
     )
 
 
@@ -232,14 +225,12 @@ def _unless_blob(line: list[StripePixels]) -> list[StripePixels]:
 def _concatenated(chains: list[StripePixels]) -> StripePixels:
     """Return the points of all chains, with the chains numbered consecutively."""
     none = np.zeros(0)
-    empty = StripePixels(
-        none.reshape(0, 2), none.reshape(0, 2), none.astype(np.int64), none, none, none
-    )
+    places = none.reshape(0, 2)
+    empty = StripePixels(places, places, none.astype(np.int64), none, none, none)
     numbered = [replace(one, chain=np.full(len(one), i)) for i, one in enumerate(chains)]
-    names = StripePixels.__slots__
-    return StripePixels(
-        *(np.concatenate([getattr(one, name) for one in (empty, *numbered)]) for name in names)
-    )
+    each = (empty, *numbered)
+    names = [field.name for field in fields(StripePixels)]
+    return StripePixels(*(np.concatenate([getattr(one, name) for one in each]) for name in names))
 
 
 class _Window(NamedTuple):

@@ -42,7 +42,6 @@ def with_junk(view: LaserView, n: int, seed: int) -> LaserView:
     angle = rng.uniform(0.0, np.pi, n)
     s = view.stripes
     stripes = StripePoints(
-        s.name,
         np.concatenate([s.pixels, rng.uniform((0.0, 0.0), RIG.size_px, (n, 2))]),
         np.concatenate([s.across, np.stack([np.cos(angle), np.sin(angle)], axis=-1)]),
         np.concatenate([s.chain, np.full(n, 1000)]),

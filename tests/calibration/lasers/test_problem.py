@@ -117,7 +117,7 @@ def line(n: int, *, sign: float = 1.0, sigma: float = 0.1) -> StripePoints:
     x = np.arange(float(n))
     pixels = np.stack([x, 100.0 + 0.1 * x], axis=-1)
     across = np.tile(sign * np.array([-0.1, 1.0]) / np.hypot(0.1, 1.0), (n, 1))
-    return StripePoints("a.png", pixels, across, np.zeros(n, np.int64), np.full(n, sigma))
+    return StripePoints(pixels, across, np.zeros(n, np.int64), np.full(n, sigma))
 
 
 def test_bins_hold_neighbours_and_end_at_gaps() -> None:

@@ -23,7 +23,6 @@ from aqualvs.optics.sheet import Sheet
 class StripePoints:
     """Points on laser stripes, found in one picture."""
 
-    name: str  # File name of the picture, for messages and reports.
     pixels: FloatArray  # Shape (N, 2): sub-pixel centres, in `image`.
     # Shape (N, 2): unit vectors in `image` at right angles to the stripe: a point is measured along
     # these only.
@@ -46,7 +45,7 @@ class StripePoints:
     def at(self, index: IntArray) -> "StripePoints":
         """Return the points with these indices (M,)."""
         pixels, across = self.pixels[index], self.across[index]
-        return StripePoints(self.name, pixels, across, self.chain[index], self.sigma_px[index])
+        return StripePoints(pixels, across, self.chain[index], self.sigma_px[index])
 
 
 # An open side of a box ends this share of the box's size beyond the outermost marker.
