@@ -35,9 +35,8 @@ from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures
 from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, board_surface, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
-from aqualvs.calibration.targets.targets import Board, MarkerSet, View
+from aqualvs.calibration.targets.targets import Board, MarkerSet
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import (
     LASER_PARAMETERS,
     Laser,
@@ -436,7 +435,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             residual_map(
                 "Corners of the target",
                 rig.size_px,
-                [_corners_of(one.name, one.corners_px) for one in result.views],
+                [one.corners for one in result.views],
                 [one.corner_residuals_px for one in result.views],
                 [one.corner_inliers for one in result.views],
             ),
@@ -446,10 +445,6 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         pictures=tuple(islice(shown, n_shots)),
         facts=facts(("rig before", str(request.rig)), ("target", str(target))),
     )
-
-
-def _corners_of(name: str, pixels: FloatArray) -> View:
-    return View(name, np.arange(len(pixels)), np.zeros((len(pixels), 3)), pixels)
 
 
 def _shot(view: LaserView, picture: Picture) -> PictureShot:

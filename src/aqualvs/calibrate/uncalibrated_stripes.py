@@ -330,12 +330,17 @@ def _next_segment(
     max_false_alarms = 0.01
     ahead, way_px, near = _ahead(ends, a, end)
     turn = _turn(ends.outward[a, end], ends.outward[by_chance, 1])
+    half_px = _WINDOW.half_px + _WINDOW.n_sigmas * float(ends.sigma_px[a, end])
+    widening = _WINDOW.widening + _WINDOW.n_sigmas * float(ends.sigma_rad[a, end])
     for b in ahead[np.argsort(way_px[ahead])]:
         turn_rad = _turn_limit(ends.sigma_rad[a, end], ends.sigma_rad[b, near[b]])
         others = (log_odds[by_chance] >= log_odds[b]) & (turn <= turn_rad)
         # One at least, so that windows do not reach across a picture with little else in it.
         n = max(int(np.count_nonzero(others)), 1)
-        if n / area_px * _window_px(ends, a, end, way_px[b]) <= max_false_alarms:
+        # Area of the window up to the segment, in square pixels.
+        far_px = max(way_px[b], 1.0)
+        window_px = (2.0 * half_px + widening * far_px) * far_px
+        if n / area_px * window_px <= max_false_alarms:
             return int(b)
         if in_line[b]:
             break
@@ -369,14 +374,6 @@ def _turn(along: FloatArray, others: FloatArray) -> FloatArray:
 
 def _turn_limit(one_rad: FloatArray, other_rad: FloatArray) -> FloatArray:
     return _WINDOW.turn_rad + _WINDOW.n_sigmas * np.hypot(one_rad, other_rad)
-
-
-def _window_px(ends: _Ends, a: int, end: int, way_px: float) -> float:
-    """Return the area of the window of an end up to a distance, in square pixels."""
-    way_px = max(way_px, 1.0)
-    half_px = _WINDOW.half_px + _WINDOW.n_sigmas * float(ends.sigma_px[a, end])
-    widening = _WINDOW.widening + _WINDOW.n_sigmas * float(ends.sigma_rad[a, end])
-    return (2.0 * half_px + widening * way_px) * way_px
 
 
 def _ends(found: list[StripeSegments], pool: IntArray) -> _Ends:

@@ -405,21 +405,14 @@ def contradicted_distances(
     problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
 ) -> CalibrationError:
     """Return the message on given distances if the pictures contradict most of them."""
-    for medium, one in enumerate(sets):
-        rival = in_other_medium(problem, medium)
-        if rival is not None and _distances_fit(problem, rival):
-            return wrong_medium(one, other_medium(one.n_medium))
-    return _wrong_lengths(problem, solution)
-
-
-def _distances_fit(problem: DomeProblem, solution: Solution[BundleState]) -> bool:
-    off = [block.lengths[0] for block in distance_blocks(problem, solution).values()]
     # Typical residual of distances, in sigmas, that agree with a solution.
     fitting = 1.5
-    return bool(np.median(off) < fitting)
-
-
-def _wrong_lengths(problem: DomeProblem, solution: Solution[BundleState]) -> CalibrationError:
+    for medium, one in enumerate(sets):
+        rival = in_other_medium(problem, medium)
+        if rival is not None:
+            off = [block.lengths[0] for block in distance_blocks(problem, rival).values()]
+            if np.median(off) < fitting:
+                return wrong_medium(one, other_medium(one.n_medium))
     boards = [i for i, shot in enumerate(problem.shots) if shot.kind is PoseKind.DISTANCE]
     free = problem.without_distances(boards)
     try:

@@ -55,7 +55,11 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     along = placed.by_along[members]
     some = slice(None, None, -(-len(members) // _LINES.n_sampled) or 1)
     i, j = _pairs(pooled.chain[members], patch)
-    guessed, offsets = _guesses(points, normal, i, j)
+    # Lines m·X = c through the pairs, m in the surface; NaN for equal points.
+    guessed = np.cross(normal, points[j] - points[i])
+    length = np.linalg.norm(guessed, axis=1)
+    guessed /= np.where(length > 1e-6, length, np.nan)[:, None]
+    offsets = np.einsum("ni,ni->n", guessed, points[i])
     # Most pairs are of two stripes; their directions are not that of the line through both points.
     good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
     guessed, offsets = guessed[good], offsets[good]
@@ -97,16 +101,6 @@ def _pairs(chain: IntArray, seed: int) -> tuple[IntArray, IntArray]:
     last = np.searchsorted(chain[order], chain[i[half]], "right")
     j[half] = order[rng.integers(first, last)]
     return i, j
-
-
-def _guesses(
-    points: FloatArray, normal: FloatArray, i: IntArray, j: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return lines m·X = c through pairs of points, m in the surface; NaN for equal points."""
-    m = np.cross(normal, points[j] - points[i])
-    length = np.linalg.norm(m, axis=1)
-    m /= np.where(length > 1e-6, length, np.nan)[:, None]
-    return m, np.einsum("ni,ni->n", m, points[i])
 
 
 def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:

@@ -20,6 +20,7 @@ from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
 from aqualvs.calibration.solver.initial_pose import target_pose
 from aqualvs.calibration.solver.least_squares import Solution
 from aqualvs.calibration.solver.result import rms_px
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
@@ -67,9 +68,8 @@ class ViewFigures:
     # middle of the corners.
     pose_angle: float
     pose_shift: float
-    # Shape (N, 2): measured corners, and their residuals.
-    corners_px: FloatArray
-    corner_residuals_px: FloatArray
+    corners: View  # Measured corners.
+    corner_residuals_px: FloatArray  # Shape (N, 2).
     # Shape (N,): inlier corners.
     corner_inliers: BoolArray
 
@@ -188,7 +188,7 @@ def view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFig
         n_stripe_points=len(view.placed),
         pose_angle=angle,
         pose_shift=shift,
-        corners_px=view.view.pixels,
+        corners=view.view,
         corner_residuals_px=corners,
         corner_inliers=inside,
     )

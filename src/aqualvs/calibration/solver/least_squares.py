@@ -8,6 +8,7 @@ The noise of each block (`Block`) is estimated from its residuals, shrunk toward
 group; the covariance follows from that estimate, not from the nominal noise.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -454,22 +455,18 @@ class _Run(Generic[State]):
         """
         while self.damping < _DESCENT.damping_limit:
             self.n_iterations += 1
-            trial = self._try(step)
-            if trial is not None and trial[2] <= here:
-                self.state, self.blocks, there = trial
-                self.damping = max(self.damping * 0.1, _DESCENT.damping_least)
-                return there
+            # A step may lead to what cannot exist.
+            with contextlib.suppress(RigError):
+                state = self.problem.moved(self.state, step)
+                blocks = tuple(self.problem.blocks(state))
+                there = self._cost(blocks)
+                if there <= here:
+                    self.state, self.blocks = state, blocks
+                    self.damping = max(self.damping * 0.1, _DESCENT.damping_least)
+                    return there
             self.damping *= 10.0
             step = self._damped_step(equations)
         return None
-
-    def _try(self, step: FloatArray) -> tuple[State, tuple[Block, ...], float] | None:
-        try:
-            state = self.problem.moved(self.state, step)
-            blocks = tuple(self.problem.blocks(state))
-        except RigError:
-            return None
-        return state, blocks, self._cost(blocks)
 
     def _cost(self, blocks: Sequence[Block]) -> float:
         # Residual, in sigmas, that stands for an observation that a step makes invisible.

@@ -99,8 +99,7 @@ def _pose(columns: list[str], row: list[str], place: str) -> BoardPose:
     distance_mm = values.get("distance_mm")
     if distance_mm is not None:
         _check_distance(distance_mm, place)
-    matrix = [values.get(key) for key in _MATRIX]
-    pose = _matrix_pose(matrix, place)
+    pose = _matrix_pose([values.get(key) for key in _MATRIX], place)
     if pose is not None and distance_mm is not None:
         _check_agreement(pose, distance_mm, place)
     return BoardPose(name, None if distance_mm is None else distance_mm / _MM, pose)

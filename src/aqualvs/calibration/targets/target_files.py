@@ -286,7 +286,13 @@ def load_board(path: str | Path) -> Board:
     file = _read(source, "a board.yaml", BoardFile)
     kind = _board_kind(file, source)
     if not _TOLERANCES.square_mm[0] <= file.square_mm <= _TOLERANCES.square_mm[1]:
-        raise CalibrationError(f"{source}: {_unlikely_square(file.square_mm)}")
+        unit = "metres" if file.square_mm < 0.5 else "centimetres"
+        too_small = file.square_mm < _TOLERANCES.square_mm[0]
+        looks = f"it looks like {unit}" if too_small else "no camera sees one whole"
+        raise CalibrationError(
+            f"{source}: square_mm is {file.square_mm:g}; {looks}, give the side of a square in "
+            "millimetres"
+        )
     squares = _squares(file, source)
     if file.dictionary:
         _check_dictionary(file.dictionary, "dictionary", source)
@@ -333,13 +339,6 @@ def _squares(file: BoardFile, source: Path) -> tuple[int, int]:
             "inner_corners_x and inner_corners_y, one less each"
         )
     return (x + 1, y + 1) if any(inner) else (x, y)
-
-
-def _unlikely_square(square_mm: float) -> str:
-    unit = "metres" if square_mm < 0.5 else "centimetres"
-    too_small = square_mm < _TOLERANCES.square_mm[0]
-    looks = f"it looks like {unit}" if too_small else "no camera sees one whole"
-    return f"square_mm is {square_mm:g}; {looks}, give the side of a square in millimetres"
 
 
 def _check_dictionary(name: str, key: str, source: Path) -> None:
