@@ -5,21 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from aqualvs.calibrate.common import (
-    WATER_N,
-    Calibration,
-    DetectedTargets,
-    Pictures,
-    check_same_size,
-    corner_residuals,
-    corner_rows,
-    counting_missed,
-    detect_boards,
-    finish,
-    medium_index,
-    picture_paths,
-    summary,
-)
+from aqualvs.calibrate import common
 from aqualvs.calibration.dome.calibrate import dome as solve_dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
 from aqualvs.calibration.solver.result import DomeCalibration
@@ -96,17 +82,17 @@ def _check_length(option: str, length_mm: float | None, least: float, most: floa
 
 
 def calibrate_dome(
-    pictures: Pictures,
+    pictures: common.Pictures,
     board: Board | str | Path,
     rig: Rig | str | Path,
     *,
     poses: str | Path | None = None,
     medium: str | float = "air",
-    water_pictures: Pictures = (),
+    water_pictures: common.Pictures = (),
     water_board: Board | str | Path | None = None,
     water_poses: str | Path | None = None,
     options: DomeOptions | None = None,
-) -> Calibration[DomeCalibration]:
+) -> common.Calibration[DomeCalibration]:
     """Solve the lens's position in the dome and the camera's rotation, from boards outside it.
 
     For a flat port, solve its distance and tilt from boards in water at unknown poses.
@@ -140,7 +126,9 @@ def calibrate_dome(
         If a file, a picture or its content cannot be used.
     """
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
-    first = _board_set(pictures, board, poses, before, medium_index(medium, before, before.n_air))
+    first = _board_set(
+        pictures, board, poses, before, common.medium_index(medium, before, before.n_air)
+    )
     sets = [first]
     if water_pictures:
         in_water = water_board or board
@@ -153,10 +141,10 @@ def calibrate_dome(
         given = completed_uncertainty(before).only(before.lens.parameter_names)
         known = merged(known, given)
     found = tuple(one for one, _ in sets)
-    with counting_missed(*found):
+    with common.counting_missed(*found):
         result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
     missed = {name: why for one in found for name, why in one.missed.items()}
-    return Calibration(
+    return common.Calibration(
         rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,
         residuals_px={view.label: view.residuals for view in result.views},
@@ -175,12 +163,12 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
     check_rig_place(request.out)
     rig = _with_housing(load_rig(request.rig, need_lasers=False), request)
     done = calibrate_dome(
-        picture_paths(request.images),
+        common.picture_paths(request.images),
         request.board,
         rig,
         poses=request.poses,
         medium=request.medium,
-        water_pictures=picture_paths(request.water_images) if request.water_images else (),
+        water_pictures=common.picture_paths(request.water_images) if request.water_images else (),
         water_board=request.water_board,
         water_poses=request.water_poses,
         options=DomeOptions(
@@ -192,9 +180,9 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
             refine_intrinsics=request.refine_intrinsics,
         ),
     )
-    for line in summary(done):
+    for line in common.summary(done):
         echo(line)
-    finish(done.rig, _page(rig, done, request), request.out, "dome", echo, request.rig)
+    common.finish(done.rig, _page(rig, done, request), request.out, "dome", echo, request.rig)
 
 
 def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
@@ -217,7 +205,7 @@ def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
         housing = Dome(1.0, 1.0, 1.49) if distance is None else FlatPort(1.0, 1.0, 1.49)
         if rig.is_air(rig.n_water):
             # A camera calibrated bare in air goes into the water with its housing.
-            rig = rig.in_water(WATER_N)
+            rig = rig.in_water(common.WATER_N)
     numbers = housing.numbers()
     # Radius or distance, thickness and index come first.
     given = ((size, 1e3), (thickness, 1e3), (request.n_acrylic, 1.0))
@@ -228,17 +216,17 @@ def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
 
 
 def _board_set(
-    pictures: Pictures,
+    pictures: common.Pictures,
     board: Board | str | Path,
     poses: str | Path | None,
     rig: Rig,
     n_medium: float,
-) -> tuple[DetectedTargets, BoardSet]:
+) -> tuple[common.DetectedTargets, BoardSet]:
     """Return the boards found in one set of pictures, and the same as input of the solver."""
     # Its faults are found before the pictures are searched.
     rows = () if poses is None else load_poses(Path(poses))
-    found = detect_boards(pictures, board)
-    check_same_size(rig, found)
+    found = common.detect_boards(pictures, board)
+    common.check_same_size(rig, found)
     given: tuple[BoardPose | None, ...] = ()
     if poses is not None:
         names = [view.name for view in found.views]
@@ -273,7 +261,9 @@ def _solved_rig(rig: Rig, result: DomeCalibration) -> Rig:
     return with_uncertainty(with_step(result.rig, "dome", step), uncertainty)
 
 
-def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest) -> CalibrationPage:
+def _page(
+    before: Rig, done: common.Calibration[DomeCalibration], request: DomeRequest
+) -> CalibrationPage:
     rig, result = done.rig, done.solution
     sigmas = result.uncertainty.sigmas
     cards = [
@@ -299,8 +289,8 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
         words=result.findings,
         expectations=expectations(rig),
         parameters=parameter_rows(rig, result.uncertainty, names, before),
-        residual_maps=(corner_residuals(result.views, rig.size_px),),
-        views=corner_rows(result.views, done.left_out),
+        residual_maps=(common.corner_residuals(result.views, rig.size_px),),
+        views=common.corner_rows(result.views, done.left_out),
         facts=facts(
             ("rig before", str(request.rig)),
             ("board", str(request.board)),

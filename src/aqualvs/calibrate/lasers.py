@@ -9,24 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.calibrate.common import (
-    N_LASERS,
-    WAVELENGTH_NM,
-    Calibration,
-    DetectedTargets,
-    Picture,
-    Pictures,
-    check_same_size,
-    counting_missed,
-    detect_boards,
-    detect_targets,
-    finish,
-    medium_index,
-    named,
-    path_text,
-    picture_paths,
-    read_colour,
-)
+from aqualvs.calibrate import common
 from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions
@@ -96,12 +79,12 @@ class _Target(NamedTuple):
 
     name: str  # In messages.
     surfaces: TargetSurfaces
-    found: DetectedTargets
+    found: common.DetectedTargets
     n_medium: float  # Refractive index outside the dome.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LasersResult(Calibration[LaserCalibration]):
+class LasersResult(common.Calibration[LaserCalibration]):
     """Result of `calibrate_lasers`."""
 
     n_medium: float  # Refractive index outside the dome in the pictures.
@@ -110,7 +93,7 @@ class LasersResult(Calibration[LaserCalibration]):
 
 
 def calibrate_lasers(
-    pictures: Pictures,
+    pictures: common.Pictures,
     rig: Rig | str | Path,
     *,
     box: MarkerSet | str | Path | None = None,
@@ -163,19 +146,19 @@ def calibrate_lasers(
     before = _with_wavelength(before, wavelength_nm)
     wavelength_nm = _wavelength(wavelength_nm, before)
     target = _detected(pictures, before, box, board, medium, board_offset)
-    check_same_size(before, target.found)
+    common.check_same_size(before, target.found)
     options = UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
     views = tuple(
-        LaserView(view, find_stripes(read_colour(picture), options))
+        LaserView(view, find_stripes(common.read_colour(picture), options))
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
     elsewhere = medium is not None or before.is_air(target.n_medium)
-    planned = None if before.lasers else before.solved_from.get(N_LASERS)
+    planned = None if before.lasers else before.solved_from.get(common.N_LASERS)
     if n_lasers is None and names is not None:
         n_lasers = len(names)
     elif n_lasers is None and isinstance(planned, int):
         n_lasers = planned
-    with counting_missed(target.found):
+    with common.counting_missed(target.found):
         result = solve_lasers(
             before,
             views,
@@ -210,7 +193,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     check_rig_place(request.out)
     before = _with_wavelength(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
     done = calibrate_lasers(
-        picture_paths(request.images),
+        common.picture_paths(request.images),
         before,
         box=request.box,
         board=request.board,
@@ -229,7 +212,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_laser_text(figures, laser))
     page = _page(before, done, request)
-    finish(done.rig, page, request.out, "lasers", echo, request.rig)
+    common.finish(done.rig, page, request.out, "lasers", echo, request.rig)
 
 
 def _camera_uncertainty(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:
@@ -282,14 +265,14 @@ def _wavelength(given: float | None, rig: Rig) -> float | None:
         if not LASER_NM[0] <= given <= LASER_NM[1]:
             raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
         return given
-    planned = rig.solved_from.get(WAVELENGTH_NM)
+    planned = rig.solved_from.get(common.WAVELENGTH_NM)
     if not rig.lasers and isinstance(planned, int | float):
         return float(planned)
     return common_wavelength(rig.lasers)
 
 
 def _detected(
-    pictures: Pictures,
+    pictures: common.Pictures,
     rig: Rig,
     box: MarkerSet | str | Path | None,
     board: Board | str | Path | None,
@@ -306,17 +289,19 @@ def _detected(
         if n_nominal is not None:
             # Air or the rig's own water, whichever is nearer to the index in the box's file.
             default = min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
-        found = detect_targets(
+        found = common.detect_targets(
             pictures,
             lambda one, image: detect_markers(image, markers, one),
-            path_text(box, "the box"),
+            common.path_text(box, "the box"),
         )
-        return _Target(named(box, "the box"), surfaces, found, medium_index(medium, rig, default))
+        return _Target(
+            common.named(box, "the box"), surfaces, found, common.medium_index(medium, rig, default)
+        )
     assert board is not None
-    found = detect_boards(pictures, board)
-    n_medium = medium_index(medium, rig, rig.n_water)
+    found = common.detect_boards(pictures, board)
+    n_medium = common.medium_index(medium, rig, rig.n_water)
     surface = board_surface(thickness=board_offset)
-    return _Target(named(board, "the board"), surface, found, n_medium)
+    return _Target(common.named(board, "the board"), surface, found, n_medium)
 
 
 def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
@@ -447,10 +432,10 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
     )
 
 
-def _shot(view: LaserView, picture: Picture) -> PictureShot:
+def _shot(view: LaserView, picture: common.Picture) -> PictureShot:
     return PictureShot(
         caption=view.view.name,
-        image=read_colour(picture),
+        image=common.read_colour(picture),
         points=(
             Overlay(pixels=view.view.pixels, colour="#ff9800", kind="circle", label="corners"),
             Overlay(

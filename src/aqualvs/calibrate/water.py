@@ -7,17 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aqualvs.calibrate.common import (
-    Calibration,
-    DetectedTargets,
-    Picture,
-    check_same_size,
-    detect_targets,
-    finish,
-    named,
-    path_text,
-    picture_paths,
-)
+from aqualvs.calibrate import common
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.targets.target_files import load_target
 from aqualvs.calibration.targets.targets import MarkerSet, View
@@ -63,13 +53,13 @@ class WaterRequest:
 
 
 def calibrate_water(
-    pictures: Sequence[Picture] | str | Path | FrameSource,
+    pictures: Sequence[common.Picture] | str | Path | FrameSource,
     target: MarkerSet | str | Path,
     rig: Rig | str | Path,
     *,
     prior: IndexPrior | None = None,
     options: IndexOptions | None = None,
-) -> Calibration[WaterCalibration]:
+) -> common.Calibration[WaterCalibration]:
     """Estimate the water's index from pictures of markers that are fixed to the vehicle.
 
     Parameters
@@ -100,12 +90,12 @@ def calibrate_water(
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
     markers = target if isinstance(target, MarkerSet) else load_target(target)
     if isinstance(pictures, Sequence | Path):
-        found = detect_targets(
+        found = common.detect_targets(
             pictures,
             lambda name, image: detect_markers(image, markers, name),
-            path_text(target, "the target"),
+            common.path_text(target, "the target"),
         )
-        check_same_size(before, found)
+        common.check_same_size(before, found)
         times = None
     else:
         found, times = _found_in(pictures, markers, before, target)
@@ -125,7 +115,7 @@ def calibrate_water(
             f"the index is known to {result.sigma:.2g} only: {why}; see --temperature-c "
             "and --salinity"
         )
-    return Calibration(
+    return common.Calibration(
         rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,
         residuals_px=result.residuals,
@@ -159,15 +149,15 @@ def run_water(request: WaterRequest, echo: Echo) -> None:
     for line in done.notes:
         echo(line)
     page = _page(done.rig, result, prior, request)
-    finish(done.rig, page, request.out, "water", echo, request.rig)
+    common.finish(done.rig, page, request.out, "water", echo, request.rig)
 
 
 def _found_in(
     source: FrameSource, markers: MarkerSet, rig: Rig, target: object
-) -> tuple[DetectedTargets, list[float]]:
+) -> tuple[common.DetectedTargets, list[float]]:
     """Return the markers found in the frames of a source, and the times of those frames."""
     check_fits(source, rig)
-    name = named(target, "the target")
+    name = common.named(target, "the target")
     views, times, missed = [], [], {}
     with progress(f"looking for {name}", source.n_frames) as tick:
         for frame in source:
@@ -181,10 +171,10 @@ def _found_in(
             tick(1)
     if not views:
         raise CalibrationError(
-            f"{path_text(target, 'the target')}: its markers are in no picture "
+            f"{common.path_text(target, 'the target')}: its markers are in no picture "
             f"of {source.name}; check its family and ids, and that the camera sees the target sharp"
         )
-    return DetectedTargets(tuple(views), (), rig.size_px, missed), times
+    return common.DetectedTargets(tuple(views), (), rig.size_px, missed), times
 
 
 def _source(request: WaterRequest) -> FrameSource:
@@ -194,7 +184,7 @@ def _source(request: WaterRequest) -> FrameSource:
     # Pictures carry no times.
     default_fps = 25.0
     if several or Path(first).suffix.lower() in IMAGE_SUFFIXES:
-        return ImageSource(picture_paths(request.source), fps=request.fps or default_fps)
+        return ImageSource(common.picture_paths(request.source), fps=request.fps or default_fps)
     fps = request.fps or (default_fps if Path(first).is_dir() else None)
     return open_source(first, fps=fps)
 
