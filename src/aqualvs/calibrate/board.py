@@ -218,7 +218,10 @@ def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list
             f"--first-id {request.first_id}: {count} markers from there, but {family} has ids 0 to "
             f"{n_ids - 1}; begin lower or print fewer"
         )
-    corners = _plate_corners(columns, rows, size)
+    # Corners (M, 4, 2) of the markers, row by row, from the first one's top left; y down.
+    column, row = np.meshgrid(np.arange(columns), np.arange(rows))
+    first = (1.0 + _PLATE_GAP_SHARE) * size * np.stack([column.ravel(), row.ravel()], axis=-1)
+    corners = first[:, None, :] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     border = _PLATE_GAP_SHARE * size if request.border_mm is None else request.border_mm
     width, height = corners.reshape(-1, 2).max(axis=0) + 2.0 * border
     paper = best_paper(request.paper, width, height, "the plate")
@@ -232,17 +235,6 @@ def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list
     save_markers(_plate_markers(request, family, ids, corners / _MM), yaml)
     page = sheet(paper, black, (float(width), float(height)), f"aqualvs plate: {what}")
     return [page], _plate_notes(request, yaml)
-
-
-def _plate_corners(columns: int, rows: int, size: float) -> FloatArray:
-    """Return the corners (M, 4, 2) of the markers, row by row, from the first one's top left.
-
-    `size` and corners are in millimetres, x to the right and y down.
-    """
-    pitch = (1.0 + _PLATE_GAP_SHARE) * size
-    column, row = np.meshgrid(np.arange(columns), np.arange(rows))
-    first = pitch * np.stack([column.ravel(), row.ravel()], axis=-1)
-    return first[:, None, :] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def _plate_markers(

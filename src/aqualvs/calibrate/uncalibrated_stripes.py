@@ -93,7 +93,16 @@ def find_stripes(
             points = _pixels_of(segments.search, segments.peaks, chain)
             lines.setdefault(int(number), []).append(points)
         first = here.stop
-    stripes = _concatenated([chain for one in lines.values() for chain in _unless_blob(one)])
+    chains = [chain for one in lines.values() for chain in _unless_blob(one)]
+    # Chains are numbered consecutively.
+    none = np.zeros(0)
+    places = none.reshape(0, 2)
+    each = [StripePixels(places, places, none.astype(np.int64), none, none, none)]
+    each += [replace(one, chain=np.full(len(one), i)) for i, one in enumerate(chains)]
+    names = [field.name for field in fields(StripePixels)]
+    stripes = StripePixels(
+        *(np.concatenate([getattr(one, name) for one in each]) for name in names)
+    )
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 
@@ -220,17 +229,6 @@ def _unless_blob(line: list[StripePixels]) -> list[StripePixels]:
     min_length_in_widths = 2.5
     width = np.median(np.concatenate([chain.width for chain in chains]))
     return chains if length >= min_length_in_widths * float(width) else []
-
-
-def _concatenated(chains: list[StripePixels]) -> StripePixels:
-    """Return the points of all chains, with the chains numbered consecutively."""
-    none = np.zeros(0)
-    places = none.reshape(0, 2)
-    empty = StripePixels(places, places, none.astype(np.int64), none, none, none)
-    numbered = [replace(one, chain=np.full(len(one), i)) for i, one in enumerate(chains)]
-    each = (empty, *numbered)
-    names = [field.name for field in fields(StripePixels)]
-    return StripePixels(*(np.concatenate([getattr(one, name) for one in each]) for name in names))
 
 
 class _Window(NamedTuple):

@@ -151,10 +151,8 @@ class LaserProblem:
     def _seen(self, state: LaserState, camera: Camera) -> list[tuple[FloatArray, FloatArray]]:
         """Return for every group its points and their derivatives, see `_moves`."""
         found: dict[int, tuple[FloatArray, FloatArray]] = {}
-        for i_view in range(len(self.bundle.views)):
+        for i_view in sorted({group.view for group in self.groups}):
             mine = [i for i, group in enumerate(self.groups) if group.view == i_view]
-            if not mine:
-                continue
             groups = [self.groups[i] for i in mine]
             pixels = np.concatenate([group.pixels for group in groups])
             surface = np.concatenate([group.surface for group in groups])
@@ -168,10 +166,9 @@ class LaserProblem:
     def _lit(self, state: LaserState, points: Sequence[FloatArray]) -> list[_Distances]:
         """Return for every group the distances of its points from their sheet, with derivatives."""
         found: dict[int, _Distances] = {}
-        for i_laser, sheet in enumerate(state.sheets):
+        for i_laser in sorted({group.laser for group in self.groups}):
+            sheet = state.sheets[i_laser]
             mine = [i for i, group in enumerate(self.groups) if group.laser == i_laser]
-            if not mine:
-                continue
             distance, by_point, by_laser = sheet.signed_distance_with_parameter_jacobian(
                 np.concatenate([points[i] for i in mine])
             )

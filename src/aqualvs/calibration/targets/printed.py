@@ -343,13 +343,6 @@ class Paper:
         width, height = self.size_mm or (np.inf, np.inf)
         return width - 2.0 * _PRINT.edge_mm, height - 2.0 * _PRINT.edge_mm - _PRINT.strip_mm
 
-    def page_mm(self, width: float, height: float) -> tuple[float, float]:
-        """Return the page's size for a print of this size."""
-        if self.size_mm is not None:
-            return self.size_mm
-        wide = max(width, _PRINT.ruler_mm + 60.0)
-        return wide + 2.0 * _PRINT.edge_mm, height + 2.0 * _PRINT.edge_mm + _PRINT.strip_mm
-
 
 def papers(word: str) -> tuple[Paper, Paper]:
     """Return a paper upright and across.
@@ -398,19 +391,23 @@ def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words
     `rectangles` (N, 4): x, y, width, height of the black areas, from the print's top left. `size`:
     width and height of the print, light border included. All in millimetres.
     """
-    width, height = paper.page_mm(*size)
-    left, top = 0.5 * (width - size[0]), _PRINT.edge_mm
-    if paper.size_mm is not None:
+    edge = _PRINT.edge_mm
+    if paper.size_mm is None:
+        width = max(size[0], _PRINT.ruler_mm + 60.0) + 2.0 * edge
+        height, top = size[1] + 2.0 * edge + _PRINT.strip_mm, edge
+    else:
+        width, height = paper.size_mm
         top = 0.5 * (height - _PRINT.strip_mm - size[1])
+    left = 0.5 * (width - size[0])
     placed = rectangles + np.array([left, top, 0.0, 0.0])
-    ruler_y = height - _PRINT.edge_mm - 8.0
+    ruler_y = height - edge - 8.0
     scale = "the line above measures exactly 100 mm: print at 100 %, without fitting to the page"
     text_mm = 3.2
     texts = (
-        Text(_PRINT.edge_mm, height - _PRINT.edge_mm - 4.2, text_mm, words),
-        Text(_PRINT.edge_mm, height - _PRINT.edge_mm, text_mm, scale),
+        Text(edge, height - edge - 4.2, text_mm, words),
+        Text(edge, height - edge, text_mm, scale),
     )
-    return PdfPage(width, height, np.concatenate([placed, ruler(_PRINT.edge_mm, ruler_y)]), texts)
+    return PdfPage(width, height, np.concatenate([placed, ruler(edge, ruler_y)]), texts)
 
 
 def ruler(x: float, y: float) -> FloatArray:
