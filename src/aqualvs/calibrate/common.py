@@ -393,8 +393,7 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
         raise CalibrationError(
             f"{target}: found in none of {len(pictures)} pictures; {name}: {why}"
         )
-    found, of = tuple(views), tuple(used)
-    return DetectedTargets(found, of, size_px, missed, target=target, copies=copies)
+    return DetectedTargets(tuple(views), tuple(used), size_px, missed, target=target, copies=copies)
 
 
 def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTargets:
@@ -424,23 +423,23 @@ def counting_missed(*sets: DetectedTargets) -> Iterator[None]:
         ) from fault
 
 
+def named(target: object, what: str) -> str:
+    """Return a file's name for messages, or `what` if its content was given instead of a path."""
+    return Path(target).name if isinstance(target, str | Path) else what
+
+
 def read_grey(picture: Picture) -> Image:
-    """Read a picture as grey; raises `CalibrationError` if it is no picture."""
+    """Read a picture as grey. Raises `CalibrationError` if it is no picture."""
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_GRAYSCALE)
     return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
 
 
 def read_colour(picture: Picture) -> Image:
-    """Read a picture as blue, green, red; raises `CalibrationError` if it is no picture."""
+    """Read a picture as blue, green, red. Raises `CalibrationError` if it is no picture."""
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_COLOR)
     return picture if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
-
-
-def named(target: object, what: str) -> str:
-    """Return a file's name for messages, or `what` if its content was given instead of a path."""
-    return Path(target).name if isinstance(target, str | Path) else what
 
 
 def path_text(target: object, what: str) -> str:

@@ -70,8 +70,7 @@ class SquareBoard:
         by_turn = 0.5 * (np.trace(off_square) * np.eye(3) - off_square)
 
         def block(group: str, axes: list[int], sigma: float) -> Block:
-            slopes = by_turn[None, axes, :] / sigma
-            off = tilt[None, axes] / sigma
+            off, slopes = tilt[None, axes] / sigma, by_turn[None, axes, :] / sigma
             return Block(group, columns[:3], off, slopes, RobustLoss.CAUCHY, scaled=False)
 
         return [block(TILTS, [0, 2], self.board_tilt_sigma), block(ROLLS, [1], self.roll_sigma)]
