@@ -112,7 +112,7 @@ def simulated(
             for i_laser, sheet in enumerate(sheets_of(rig))
             for k in range(len(surfaces.planes))
         ]
-        found.append(LaserView(view, _joined(name, stripes)))
+        found.append(LaserView(view, _joined(stripes)))
     return found
 
 
@@ -179,11 +179,11 @@ def _lit(pose: SE3, surface: Plane, sheet: Sheet, spacing: float) -> tuple[Float
     return points[ahead], up[ahead]
 
 
-def _joined(name: str, stripes: list[tuple[FloatArray, FloatArray]]) -> StripePoints:
+def _joined(stripes: list[tuple[FloatArray, FloatArray]]) -> StripePoints:
     pixels = np.concatenate([s[0] for s in stripes])
     chain = np.concatenate([np.full(len(s[0]), i) for i, s in enumerate(stripes)])
     across = np.concatenate([s[1] for s in stripes])
-    return StripePoints(name, pixels, across, chain, np.full(len(pixels), 0.1))
+    return StripePoints(pixels, across, chain, np.full(len(pixels), 0.1))
 
 
 def box_views(

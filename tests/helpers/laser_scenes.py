@@ -144,7 +144,7 @@ def _view(
     chains += _edges(rng, pose, size, low, high, clutter.edges)
     pixels = [_seen(camera, points) for points in chains]
     pixels += [glint(rng, rig.size_px) for _ in range(rng.poisson(clutter.glints))]
-    stripes = _stripes(name, rng, [p for p in pixels if len(p) >= 12], noise_px)
+    stripes = _stripes(rng, [p for p in pixels if len(p) >= 12], noise_px)
     x, y = np.meshgrid(np.arange(1, SQUARES[0]), np.arange(1, SQUARES[1]))
     corners = SQUARE * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
     # What corners of a tenth of a pixel leave of a pose.
@@ -225,9 +225,7 @@ def glint(rng: np.random.Generator, size_px: tuple[int, int]) -> FloatArray:
     return inside
 
 
-def _stripes(
-    name: str, rng: np.random.Generator, chains: list[FloatArray], noise_px: float
-) -> StripePoints:
+def _stripes(rng: np.random.Generator, chains: list[FloatArray], noise_px: float) -> StripePoints:
     across = []
     for pixels in chains:
         along = np.gradient(pixels, axis=0)
@@ -237,14 +235,13 @@ def _stripes(
     pixels = np.concatenate([np.zeros((0, 2)), *chains])
     chain = np.repeat(np.arange(len(chains)), [len(c) for c in chains])
     errors = noise_px * rng.standard_normal((len(pixels), 1))
-    return StripePoints(name, pixels + errors * sides, sides, chain, np.full(len(pixels), 0.1))
+    return StripePoints(pixels + errors * sides, sides, chain, np.full(len(pixels), 0.1))
 
 
 def joined(stripes: StripePoints, pixels: FloatArray) -> StripePoints:
     """Return the stripes with one more chain."""
-    more = _stripes(stripes.name, np.random.default_rng(0), [pixels], 0.0)
+    more = _stripes(np.random.default_rng(0), [pixels], 0.0)
     return StripePoints(
-        stripes.name,
         np.concatenate([stripes.pixels, more.pixels]),
         np.concatenate([stripes.across, more.across]),
         np.concatenate([stripes.chain, more.chain + stripes.chain.max(initial=-1) + 1]),

@@ -40,8 +40,6 @@ _MM = 1e3
 _BORDER_SHARE = 0.25
 # Gap between the markers of a plate and width of its border, as a share of a marker.
 _PLATE_GAP_SHARE = 0.25
-# Numbers of markers of OpenCV's dictionaries DICT_4X4_50 to DICT_4X4_1000.
-_DICTIONARY_SIZES = (50, 100, 250, 1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,10 +74,7 @@ class BoardRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse counts and lengths that cannot be printed.
-
-        Raises `OptionError` naming the option and its value.
-        """
+        """Raise `OptionError` for counts and lengths that cannot be printed."""
         check_options(self, "squares_x", "squares_y", least=1.0, wanted="1 or more")
         # A length below a millimetre was most likely given in metres.
         lengths = ("square_mm", "marker_mm", "width_mm", "height_mm", "depth_mm")
@@ -98,13 +93,9 @@ def print_board(request: BoardRequest, echo: Echo) -> None:
         raise OptionError(f"--out: {out} names no file; give one, such as {out / 'board'}")
     pdf, yaml = out.with_name(f"{out.name}.pdf"), out.with_name(f"{out.name}.yaml")
     with Claim("board", [pdf, yaml], overwrite=request.overwrite):
+        printers = {"box": _print_box, "plate": _print_plate}
         try:
-            if request.kind == "box":
-                pages, notes = _print_box(request, yaml)
-            elif request.kind == "plate":
-                pages, notes = _print_plate(request, yaml)
-            else:
-                pages, notes = _print_squares(request, yaml)
+            pages, notes = printers.get(request.kind, _print_squares)(request, yaml)
         except CalibrationError as fault:
             raise OptionError(str(fault)) from None
         with writing(pdf):
@@ -134,20 +125,19 @@ def _board(request: BoardRequest) -> Board:
     squares = (request.squares_x or 11, request.squares_y or 8)
     square = request.square_mm or _largest_square(request, squares)
     border = _BORDER_SHARE * square if request.border_mm is None else request.border_mm
-    if request.kind == "chessboard":
-        return Board(
-            kind=BoardKind.CHESSBOARD, squares=squares, square=square / _MM, border=border / _MM
-        )
-    n_markers = squares[0] * squares[1] // 2
-    # Ratio of marker to square, about that of OpenCV's own boards.
-    marker_share = 0.75
-    marker = marker_share * square if request.marker_mm is None else request.marker_mm
+    kind = BoardKind(request.kind)
+    marker, dictionary = 0.0, ""
+    if kind is BoardKind.CHARUCO:
+        # Ratio of marker to square, about that of OpenCV's own boards.
+        marker_share = 0.75
+        marker = marker_share * square if request.marker_mm is None else request.marker_mm
+        dictionary = request.dictionary or _smallest_dictionary(squares[0] * squares[1] // 2)
     return Board(
-        kind=BoardKind.CHARUCO,
+        kind=kind,
         squares=squares,
         square=square / _MM,
         marker=marker / _MM,
-        dictionary=request.dictionary or _smallest_dictionary(n_markers),
+        dictionary=dictionary,
         border=border / _MM,
     )
 
@@ -171,13 +161,11 @@ def _largest_square(request: BoardRequest, squares: tuple[int, int]) -> float:
 
 
 def _smallest_dictionary(n_markers: int) -> str:
-    fitting = [n for n in _DICTIONARY_SIZES if n >= n_markers]
-    if not fitting:
-        raise OptionError(
-            f"{n_markers} markers: no dictionary has more than {_DICTIONARY_SIZES[-1]}; take fewer "
-            "squares"
-        )
-    return f"DICT_4X4_{fitting[0]}"
+    # Numbers of markers of OpenCV's dictionaries.
+    for n in (50, 100, 250, 1000):
+        if n >= n_markers:
+            return f"DICT_4X4_{n}"
+    raise OptionError(f"{n_markers} markers: no dictionary has more than {n}; take fewer squares")
 
 
 def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
@@ -223,13 +211,21 @@ def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list
     """Write the file of a plate; return its page and notes."""
     columns, rows = request.squares_x or 3, request.squares_y or 2
     size = request.marker_mm or 12.0
-    family = request.dictionary or "DICT_APRILTAG_36h11"
-    _check_ids(family, request.first_id, columns * rows)
-    corners = _plate_corners(columns, rows, size)
+    family, count = request.dictionary or "DICT_APRILTAG_36h11", columns * rows
+    n_ids = len(aruco_dictionary(family).bytesList)
+    if request.first_id < 0 or request.first_id + count > n_ids:
+        raise OptionError(
+            f"--first-id {request.first_id}: {count} markers from there, but {family} has ids 0 to "
+            f"{n_ids - 1}; begin lower or print fewer"
+        )
+    # Corners (M, 4, 2) of the markers, row by row, from the first one's top left; y down.
+    column, row = np.meshgrid(np.arange(columns), np.arange(rows))
+    first = (1.0 + _PLATE_GAP_SHARE) * size * np.stack([column.ravel(), row.ravel()], axis=-1)
+    corners = first[:, None, :] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     border = _PLATE_GAP_SHARE * size if request.border_mm is None else request.border_mm
     width, height = corners.reshape(-1, 2).max(axis=0) + 2.0 * border
     paper = best_paper(request.paper, width, height, "the plate")
-    ids = request.first_id + np.arange(columns * rows, dtype=np.int64)
+    ids = request.first_id + np.arange(count, dtype=np.int64)
     rectangles = [
         marker_rectangles(family, int(number), corner[0] + border, size)
         for number, corner in zip(ids, corners, strict=True)
@@ -237,20 +233,8 @@ def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list
     black = np.concatenate([*rectangles, outline(0.0, 0.0, width, height)])
     what = f"{columns} x {rows} markers of {size:g} mm, {family}, ids {ids[0]}-{ids[-1]}"
     save_markers(_plate_markers(request, family, ids, corners / _MM), yaml)
-    return [
-        sheet(paper, black, (float(width), float(height)), f"aqualvs plate: {what}")
-    ], _plate_notes(request, yaml)
-
-
-def _plate_corners(columns: int, rows: int, size: float) -> FloatArray:
-    """Return the corners (M, 4, 2) of the markers, row by row, from the first one's top left.
-
-    `size` and corners are in millimetres, x to the right and y down.
-    """
-    pitch = (1.0 + _PLATE_GAP_SHARE) * size
-    column, row = np.meshgrid(np.arange(columns), np.arange(rows))
-    first = pitch * np.stack([column.ravel(), row.ravel()], axis=-1)
-    return first[:, None, :] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    page = sheet(paper, black, (float(width), float(height)), f"aqualvs plate: {what}")
+    return [page], _plate_notes(request, yaml)
 
 
 def _plate_markers(
@@ -278,12 +262,3 @@ def _plate_notes(request: BoardRequest, yaml: Path) -> list[str]:
         f"marker {request.first_id} is in the dome's frame, and print again with --position-mm "
         "X Y Z (and --rotation-deg if the plate does not face straight back)",
     ]
-
-
-def _check_ids(family: str, first_id: int, count: int) -> None:
-    n_ids = len(aruco_dictionary(family).bytesList)
-    if first_id < 0 or first_id + count > n_ids:
-        raise OptionError(
-            f"--first-id {first_id}: {count} markers from there, but {family} has ids 0 to "
-            f"{n_ids - 1}; begin lower or print fewer"
-        )

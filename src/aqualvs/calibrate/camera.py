@@ -5,22 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aqualvs.calibrate.common import (
-    N_LASERS,
-    WAVELENGTH_NM,
-    Calibration,
-    DetectedTargets,
-    Nominal,
-    Pictures,
-    corner_residuals,
-    corner_rows,
-    counting_missed,
-    detect_boards,
-    finish,
-    load_nominal,
-    picture_paths,
-    summary,
-)
+from aqualvs.calibrate import common
 from aqualvs.calibration.camera.calibrate import CameraCalibration
 from aqualvs.calibration.camera.calibrate import camera as solve_camera
 from aqualvs.calibration.targets.targets import Board
@@ -48,13 +33,13 @@ class CameraRequest:
 
 
 def calibrate_camera(
-    pictures: Pictures,
+    pictures: common.Pictures,
     board: Board | str | Path,
     *,
-    nominal: Nominal | str | Path | None = None,
+    nominal: common.Nominal | str | Path | None = None,
     model: LensModel | str = LensModel.OPENCV,
     n_coefficients: int | None = None,
-) -> Calibration[CameraCalibration]:
+) -> common.Calibration[CameraCalibration]:
     """Solve the intrinsics from pictures of a board in air, taken without the dome.
 
     Parameters
@@ -81,14 +66,23 @@ def calibrate_camera(
     AqualvsError
         If a file, a picture or its content cannot be used.
     """
-    known = load_nominal(Path(nominal)) if isinstance(nominal, str | Path) else nominal or Nominal()
-    found = detect_boards(pictures, board)
-    _check_size(found, known, nominal)
-    with counting_missed(found):
+    known = (
+        common.load_nominal(Path(nominal))
+        if isinstance(nominal, str | Path)
+        else nominal or common.Nominal()
+    )
+    found = common.detect_boards(pictures, board)
+    if known.size_px is not None and known.size_px != found.size_px:
+        (w, h), (nw, nh) = found.size_px, known.size_px
+        raise CalibrationError(
+            f"{found.first}: {w}x{h} px, but {common.path_text(nominal, 'the nominal rig')} says "
+            f"{nw}x{nh} px; calibrate at the size that the camera is used at, or correct that file"
+        )
+    with common.counting_missed(found):
         result = solve_camera(
             found.views, found.size_px, model=LensModel(model), n_coefficients=n_coefficients
         )
-    return Calibration(
+    return common.Calibration(
         rig=_solved_rig(result, known),
         uncertainty=result.uncertainty,
         residuals_px={view.label: view.residuals for view in result.views},
@@ -106,29 +100,18 @@ def run_camera(request: CameraRequest, echo: Echo) -> None:
     """
     check_rig_place(request.out)
     done = calibrate_camera(
-        picture_paths(request.images),
+        common.picture_paths(request.images),
         request.board,
         nominal=request.nominal,
         model=request.model,
         n_coefficients=request.n_coefficients,
     )
-    result, found = done.solution, done.found[0]
-    for line in summary(done):
+    for line in common.summary(done):
         echo(line)
-    finish(done.rig, _page(done.rig, result, found, request), request.out, "camera", echo)
+    common.finish(done.rig, _page(done, request), request.out, "camera", echo)
 
 
-def _check_size(found: DetectedTargets, nominal: Nominal, source: object) -> None:
-    if nominal.size_px is not None and nominal.size_px != found.size_px:
-        (w, h), (nw, nh) = found.size_px, nominal.size_px
-        where = source if isinstance(source, str | Path) else "the nominal rig"
-        raise CalibrationError(
-            f"{found.first}: {w}x{h} px, but {where} says {nw}x{nh} px; calibrate at "
-            "the size that the camera is used at, or correct that file"
-        )
-
-
-def _solved_rig(result: CameraCalibration, nominal: Nominal) -> Rig:
+def _solved_rig(result: CameraCalibration, nominal: common.Nominal) -> Rig:
     """Return the nominal rig with the solved intrinsics and a note of this step."""
     rig = Rig(
         name=nominal.name,
@@ -146,16 +129,14 @@ def _solved_rig(result: CameraCalibration, nominal: Nominal) -> Rig:
         pictures=len(result.views), points=result.n_points, rms_px=result.rms_px, extras={}
     )
     # The calibration of the lasers searches for this number and colour.
-    planned = {N_LASERS: nominal.n_lasers, WAVELENGTH_NM: nominal.wavelength_nm}
+    planned = {common.N_LASERS: nominal.n_lasers, common.WAVELENGTH_NM: nominal.wavelength_nm}
     rig = replace(rig, solved_from={k: value for k, value in planned.items() if value is not None})
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)
 
 
-def _page(
-    rig: Rig, result: CameraCalibration, found: DetectedTargets, request: CameraRequest
-) -> CalibrationPage:
-    sigmas = result.uncertainty.sigmas
-    lens = result.lens
+def _page(done: common.Calibration[CameraCalibration], request: CameraRequest) -> CalibrationPage:
+    rig, result, found = done.rig, done.solution, done.found[0]
+    sigmas, lens = result.uncertainty.sigmas, result.lens
     cards = [
         Card("residual", f"{result.rms_px:.3f} px", "rms distance of corners"),
         Card(
@@ -166,13 +147,8 @@ def _page(
         Card("pictures", str(len(result.views)), f"{result.n_points:,} corners"),
     ]
     if np.isfinite(result.cross_validation_rms_px):
-        cards.append(
-            Card(
-                "held-out views",
-                f"{result.cross_validation_rms_px:.3f} px",
-                "corners predicted, rms",
-            )
-        )
+        held_px = f"{result.cross_validation_rms_px:.3f} px"
+        cards.append(Card("held-out views", held_px, "corners predicted, rms"))
     return CalibrationPage(
         title="Calibration of the camera",
         subtitle=f"Rig “{rig.name}”",
@@ -180,8 +156,8 @@ def _page(
         warnings=(*found.remarks, *(f"{name}: {why}" for name, why in result.left_out.items())),
         words=result.findings,
         parameters=parameter_rows(rig, result.uncertainty, lens.parameter_names),
-        residual_maps=(corner_residuals(result.views, result.size_px),),
-        views=corner_rows(result.views, {**found.missed, **result.left_out}),
+        residual_maps=(common.corner_residuals(result.views, result.size_px),),
+        views=common.corner_rows(result.views, {**found.missed, **result.left_out}),
         facts=facts(
             ("board", str(request.board)),
             ("nominal rig", str(request.nominal or "none")),

@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field
 
 from aqualvs.calibration.camera.calibrate import CameraCalibration
 from aqualvs.calibration.detection.detection import detect_board
-from aqualvs.calibration.solver.result import DomeCalibration, ViewFit
+from aqualvs.calibration.solver.result import DomeCalibration, ViewFit, rms_px
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board, View
 from aqualvs.calibration_formats import refuse_foreign
@@ -133,10 +133,8 @@ def load_nominal(path: Path) -> Nominal:
     content = parse_yaml(text, str(path), RigError)
     if not isinstance(content, Mapping):
         raise RigError(f"{path}: is not a nominal rig; write keys such as 'dome: ...'")
-    return _from_rig_file(path) if "aqualvs_rig" in content else _from_mapping(content, path)
-
-
-def _from_rig_file(path: Path) -> Nominal:
+    if "aqualvs_rig" not in content:
+        return _from_mapping(content, path)
     rig = load_rig(path, need_lasers=False)
     return Nominal(
         name=rig.name,
@@ -218,14 +216,11 @@ class DetectedTargets:
         for view in self.views:
             for note in view.notes:
                 names.setdefault(note, []).append(view.name)
-        return [f"{_abridged(where)}: {note}" for note, where in names.items()]
-
-
-def _abridged(names: Sequence[str]) -> str:
-    """Return the first three names, and the number of further ones."""
-    n_shown = 3
-    more = len(names) - n_shown
-    return ", ".join(names[:n_shown]) + (f" and {more} more" if more > 0 else "")
+        notes = []
+        for note, where in names.items():
+            more = f" and {len(where) - 3} more" if len(where) > 3 else ""
+            notes.append(f"{', '.join(where[:3])}{more}: {note}")
+        return notes
 
 
 SolutionT = TypeVar("SolutionT")
@@ -267,8 +262,7 @@ class Calibration(Generic[SolutionT]):
     @property
     def rms_px(self) -> float:
         """Root mean square length of the residuals."""
-        stacked = np.concatenate(list(self.residuals_px.values()))
-        return float(np.sqrt(np.mean(np.sum(stacked**2, axis=1))))
+        return rms_px(np.concatenate(list(self.residuals_px.values())))
 
 
 def summary(done: Calibration[CameraCalibration] | Calibration[DomeCalibration]) -> list[str]:
@@ -323,8 +317,7 @@ def _matching_paths(argument: str) -> list[Path]:
         return [path]
     if glob.has_magic(argument):
         matches = [Path(match) for match in glob.glob(argument, recursive=True)]
-        found = [p for p in matches if p.is_file()]
-        if found:
+        if found := [p for p in matches if p.is_file()]:
             return sorted(found, key=natural_key)
         raise CalibrationError(f"{argument}: no file matches this pattern; check folder and ending")
     raise CalibrationError(f"{path}: no such picture or folder; check the path")
@@ -355,20 +348,10 @@ def _picture_list(pictures: Pictures) -> list[Picture]:
 def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedTargets:
     """Find a target in every picture.
 
-    Parameters
-    ----------
-    pictures : iterable of Picture, str or Path
-        Files or pixels (then named "picture 0", "picture 1", ...), or one folder or pattern.
-    detect : callable
-        Detector that is called with the name and the grey pixels of each picture, in several
-        threads.
-    target : str
-        The target in messages: the path of its file, or "the board".
-
-    Raises
-    ------
-    CalibrationError
-        If a picture cannot be read, the target is in none of them, or they differ in size.
+    Pictures without a file are named "picture 0", "picture 1", and so on. `detect` is called in
+    several threads; `target` is the target in messages: the path of its file, or "the board".
+    Raises `CalibrationError` if a picture cannot be read, the target is in none of them, or they
+    differ in size.
     """
     # More threads do not detect faster in small pictures.
     threads = 4
@@ -388,53 +371,29 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
         results = list(pool.map(detect_in, names, pictures))
     if not results:
         raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
-    size_px = _common_size(
-        [
-            picture if isinstance(picture, str | Path) else name
-            for name, picture in zip(names, pictures, strict=True)
-        ],
-        [size for _, size in results],
-    )
-    views = [view for view, _ in results]
-    copies = _copies(views)
-    missed = {
-        names[i]: view if isinstance(view, str) else f"it is a copy of {copies[i]}"
-        for i, view in enumerate(views)
-        if isinstance(view, str) or i in copies
-    }
-    found = [
-        (pictures[i], view)
-        for i, view in enumerate(views)
-        if isinstance(view, View) and i not in copies
-    ]
-    if not found:
+    paths = [path_text(picture, name) for name, picture in zip(names, pictures, strict=True)]
+    size_px = _common_size(paths, [size for _, size in results])
+    views, used, missed, copies = [], [], {}, {}
+    # Copies of a picture, whose views are equal to the bit, add no evidence, but would make the
+    # sigmas smaller.
+    first: dict[bytes, View] = {}
+    for name, picture, (view, _) in zip(names, pictures, results, strict=True):
+        if isinstance(view, str):
+            missed[name] = view
+            continue
+        original = first.setdefault(view.ids.tobytes() + view.pixels.tobytes(), view)
+        if original is view:
+            views.append(view)
+            used.append(picture)
+        else:
+            copies[name] = original.name
+            missed[name] = f"it is a copy of {original.name}"
+    if not views:
         name, why = next(iter(missed.items()))
         raise CalibrationError(
             f"{target}: found in none of {len(pictures)} pictures; {name}: {why}"
         )
-    return DetectedTargets(
-        tuple(view for _, view in found),
-        tuple(one for one, _ in found),
-        size_px,
-        missed,
-        target=target,
-        copies={names[i]: original for i, original in copies.items()},
-    )
-
-
-def _copies(views: Sequence[View | str]) -> dict[int, str]:
-    """Return the places of views that equal an earlier one to the bit, with the name of that one.
-
-    Copies of a picture add no evidence, but would make the sigmas smaller.
-    """
-    first: dict[bytes, View] = {}
-    copies = {}
-    for i, view in enumerate(views):
-        if isinstance(view, View):
-            original = first.setdefault(view.ids.tobytes() + view.pixels.tobytes(), view)
-            if original is not view:
-                copies[i] = original.name
-    return copies
+    return DetectedTargets(tuple(views), tuple(used), size_px, missed, target=target, copies=copies)
 
 
 def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTargets:
@@ -470,20 +429,14 @@ def named(target: object, what: str) -> str:
 
 
 def read_grey(picture: Picture) -> Image:
-    """Read a picture as grey.
-
-    Raises `CalibrationError` if it is no picture.
-    """
+    """Read a picture as grey. Raises `CalibrationError` if it is no picture."""
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_GRAYSCALE)
     return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
 
 
 def read_colour(picture: Picture) -> Image:
-    """Read a picture as blue, green, red.
-
-    Raises `CalibrationError` if it is no picture.
-    """
+    """Read a picture as blue, green, red. Raises `CalibrationError` if it is no picture."""
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_COLOR)
     return picture if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
@@ -515,13 +468,8 @@ def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
 
 def corner_residuals(views: Sequence[ViewFit], size_px: tuple[int, int]) -> ResidualMap:
     """Return the map of the residuals of all views' corners over the picture."""
-    return residual_map(
-        "Corners of all views",
-        size_px,
-        [fit.view for fit in views],
-        [fit.residuals for fit in views],
-        [fit.inliers for fit in views],
-    )
+    parts = zip(*((fit.view, fit.residuals, fit.inliers) for fit in views), strict=True)
+    return residual_map("Corners of all views", size_px, *parts)
 
 
 def corner_rows(views: Sequence[ViewFit], missed: Mapping[str, str]) -> tuple[ViewRow, ...]:
@@ -531,24 +479,16 @@ def corner_rows(views: Sequence[ViewFit], missed: Mapping[str, str]) -> tuple[Vi
 
 
 def finish(
-    rig: Rig,
-    page: CalibrationPage,
-    out: Path,
-    step: str,
-    echo: Echo,
-    *,
-    comments_of: Path | None = None,
+    rig: Rig, page: CalibrationPage, out: Path, step: str, echo: Echo, before: Path | None = None
 ) -> None:
     """Write the rig and the page of a calibration, and print their paths.
 
-    Existing files of these names are kept under dated names. `comments_of` is the rig file whose
-    comments are copied.
-
-    Raises `OutputError` if a file cannot be written, or `out` exists and is no rig.
+    Existing files of these names are kept under dated names; comments of the rig file `before` are
+    copied. Raises `OutputError` if a file cannot be written, or `out` exists and is no rig.
     """
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-    copy = save_rig(rig, out, comments_of=comments_of)
+    copy = save_rig(rig, out, comments_of=before)
     if copy is not None:
         echo(f"kept: {copy}")
     echo(f"rig: {out}")
@@ -585,7 +525,7 @@ def _read(path: Path, flags: int) -> Image:
     return image
 
 
-def _common_size(names: Sequence[object], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+def _common_size(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
     """Return the size of all pictures; refuse the first one of another size than most."""
     usual = max(set(sizes), key=sizes.count)
     for name, size in zip(names, sizes, strict=True):

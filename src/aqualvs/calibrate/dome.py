@@ -5,21 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from aqualvs.calibrate.common import (
-    WATER_N,
-    Calibration,
-    DetectedTargets,
-    Pictures,
-    check_same_size,
-    corner_residuals,
-    corner_rows,
-    counting_missed,
-    detect_boards,
-    finish,
-    medium_index,
-    picture_paths,
-    summary,
-)
+from aqualvs.calibrate import common
 from aqualvs.calibration.dome.calibrate import dome as solve_dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
 from aqualvs.calibration.solver.result import DomeCalibration
@@ -71,10 +57,7 @@ class DomeRequest:
     refine_intrinsics: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse negative tolerances, and housings that cannot be.
-
-        Raises `OptionError` naming the option and its value.
-        """
+        """Raise `OptionError` for negative tolerances, and housings that cannot be."""
         _check_length("--inner-radius-mm", self.inner_radius_mm, 1.0, 2000.0)
         _check_length("--port-distance-mm", self.port_distance_mm, 0.1, 2000.0)
         # Zero is an infinitely thin housing.
@@ -99,17 +82,17 @@ def _check_length(option: str, length_mm: float | None, least: float, most: floa
 
 
 def calibrate_dome(
-    pictures: Pictures,
+    pictures: common.Pictures,
     board: Board | str | Path,
     rig: Rig | str | Path,
     *,
     poses: str | Path | None = None,
     medium: str | float = "air",
-    water_pictures: Pictures = (),
+    water_pictures: common.Pictures = (),
     water_board: Board | str | Path | None = None,
     water_poses: str | Path | None = None,
     options: DomeOptions | None = None,
-) -> Calibration[DomeCalibration]:
+) -> common.Calibration[DomeCalibration]:
     """Solve the lens's position in the dome and the camera's rotation, from boards outside it.
 
     For a flat port, solve its distance and tilt from boards in water at unknown poses.
@@ -143,7 +126,9 @@ def calibrate_dome(
         If a file, a picture or its content cannot be used.
     """
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
-    first = _board_set(pictures, board, poses, before, medium_index(medium, before, before.n_air))
+    first = _board_set(
+        pictures, board, poses, before, common.medium_index(medium, before, before.n_air)
+    )
     sets = [first]
     if water_pictures:
         in_water = water_board or board
@@ -156,10 +141,10 @@ def calibrate_dome(
         given = completed_uncertainty(before).only(before.lens.parameter_names)
         known = merged(known, given)
     found = tuple(one for one, _ in sets)
-    with counting_missed(*found):
+    with common.counting_missed(*found):
         result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
     missed = {name: why for one in found for name, why in one.missed.items()}
-    return Calibration(
+    return common.Calibration(
         rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,
         residuals_px={view.label: view.residuals for view in result.views},
@@ -178,12 +163,12 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
     check_rig_place(request.out)
     rig = _with_housing(load_rig(request.rig, need_lasers=False), request)
     done = calibrate_dome(
-        picture_paths(request.images),
+        common.picture_paths(request.images),
         request.board,
         rig,
         poses=request.poses,
         medium=request.medium,
-        water_pictures=picture_paths(request.water_images) if request.water_images else (),
+        water_pictures=common.picture_paths(request.water_images) if request.water_images else (),
         water_board=request.water_board,
         water_poses=request.water_poses,
         options=DomeOptions(
@@ -195,9 +180,9 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
             refine_intrinsics=request.refine_intrinsics,
         ),
     )
-    for line in summary(done):
+    for line in common.summary(done):
         echo(line)
-    finish(done.rig, _page(rig, done, request), request.out, "dome", echo, comments_of=request.rig)
+    common.finish(done.rig, _page(rig, done, request), request.out, "dome", echo, request.rig)
 
 
 def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
@@ -220,33 +205,30 @@ def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
         housing = Dome(1.0, 1.0, 1.49) if distance is None else FlatPort(1.0, 1.0, 1.49)
         if rig.is_air(rig.n_water):
             # A camera calibrated bare in air goes into the water with its housing.
-            rig = rig.in_water(WATER_N)
+            rig = rig.in_water(common.WATER_N)
     numbers = housing.numbers()
-    given = (
-        size if size is None else size / 1e3,
-        thickness if thickness is None else thickness / 1e3,
-        request.n_acrylic,
-    )
     # Radius or distance, thickness and index come first.
-    for name, value in zip(numbers, given, strict=False):
+    given = ((size, 1e3), (thickness, 1e3), (request.n_acrylic, 1.0))
+    for name, (value, per_unit) in zip(numbers, given, strict=False):
         if value is not None:
-            numbers[name] = value
+            numbers[name] = value / per_unit
     return replace(rig, housing=type(housing)(*numbers.values()))
 
 
 def _board_set(
-    pictures: Pictures,
+    pictures: common.Pictures,
     board: Board | str | Path,
     poses: str | Path | None,
     rig: Rig,
     n_medium: float,
-) -> tuple[DetectedTargets, BoardSet]:
+) -> tuple[common.DetectedTargets, BoardSet]:
     """Return the boards found in one set of pictures, and the same as input of the solver."""
-    rows = None if poses is None else load_poses(Path(poses))
-    found = detect_boards(pictures, board)
-    check_same_size(rig, found)
+    # Its faults are found before the pictures are searched.
+    rows = () if poses is None else load_poses(Path(poses))
+    found = common.detect_boards(pictures, board)
+    common.check_same_size(rig, found)
     given: tuple[BoardPose | None, ...] = ()
-    if rows is not None and poses is not None:
+    if poses is not None:
         names = [view.name for view in found.views]
         given, notes = match_poses(rows, names, Path(poses), copies=found.copies)
         found = replace(found, pose_notes=notes)
@@ -264,11 +246,9 @@ def _board_set(
 def _solved_rig(rig: Rig, result: DomeCalibration) -> Rig:
     """Return the solved rig with its covariance and a note of this step."""
     uncertainty = merged(rig_uncertainty(rig), result.uncertainty)
-    names = set(rig_uncertainty(rig).names)
     solved = set(parameter_names(rig.camera())) - set(rig.lens.parameter_names)
-    assumed = [
-        file_parameter_name(name) for name in result.uncertainty.names if name not in names | solved
-    ]
+    known = solved | set(rig_uncertainty(rig).names)
+    assumed = [file_parameter_name(n) for n in result.uncertainty.names if n not in known]
     step = SolvedStep(
         pictures=len(result.views),
         points=result.n_points,
@@ -281,7 +261,9 @@ def _solved_rig(rig: Rig, result: DomeCalibration) -> Rig:
     return with_uncertainty(with_step(result.rig, "dome", step), uncertainty)
 
 
-def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest) -> CalibrationPage:
+def _page(
+    before: Rig, done: common.Calibration[DomeCalibration], request: DomeRequest
+) -> CalibrationPage:
     rig, result = done.rig, done.solution
     sigmas = result.uncertainty.sigmas
     cards = [
@@ -291,14 +273,10 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
     ]
     if result.cross_validation is not None:
         held = result.cross_validation
-        cards.append(
-            Card(
-                "held-out views",
-                f"{held.dome_rms_px:.2f} px",
-                f"a bare lens: {held.bare_rms_px:.2f} px",
-            )
-        )
+        bare = f"a bare lens: {held.bare_rms_px:.2f} px"
+        cards.append(Card("held-out views", f"{held.dome_rms_px:.2f} px", bare))
     port_names = [name for name in rig.camera().params.port.names if name in sigmas]
+    names = [*POSE_PARAMETERS, *port_names, *rig.lens.parameter_names]
     what = "dome" if rig.flat_port is None else "flat port"
     return CalibrationPage(
         title=f"Calibration of the {what}",
@@ -310,14 +288,9 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
         ),
         words=result.findings,
         expectations=expectations(rig),
-        parameters=parameter_rows(
-            rig,
-            result.uncertainty,
-            [*POSE_PARAMETERS, *port_names, *rig.lens.parameter_names],
-            before,
-        ),
-        residual_maps=(corner_residuals(result.views, rig.size_px),),
-        views=corner_rows(result.views, done.left_out),
+        parameters=parameter_rows(rig, result.uncertainty, names, before),
+        residual_maps=(common.corner_residuals(result.views, rig.size_px),),
+        views=common.corner_rows(result.views, done.left_out),
         facts=facts(
             ("rig before", str(request.rig)),
             ("board", str(request.board)),

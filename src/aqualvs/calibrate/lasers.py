@@ -5,43 +5,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.calibrate.common import (
-    N_LASERS,
-    WAVELENGTH_NM,
-    Calibration,
-    DetectedTargets,
-    Picture,
-    Pictures,
-    check_same_size,
-    counting_missed,
-    detect_boards,
-    detect_targets,
-    finish,
-    medium_index,
-    named,
-    path_text,
-    picture_paths,
-    read_colour,
-)
+from aqualvs.calibrate import common
 from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures
-from aqualvs.calibration.lasers.stripes_on_planes import (
-    StripePoints,
-    TargetSurfaces,
-    board_surface,
-    box_surfaces,
-)
+from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, board_surface, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
-from aqualvs.calibration.targets.targets import Board, MarkerSet, View
+from aqualvs.calibration.targets.targets import Board, MarkerSet
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import (
     LASER_PARAMETERS,
     Laser,
@@ -66,7 +44,6 @@ from aqualvs.report.calibration_material import (
     CalibrationPage,
     LaserRow,
     Overlay,
-    ParameterRow,
     PictureShot,
     ViewRow,
     expectations,
@@ -78,9 +55,6 @@ from aqualvs.report.calibration_material import (
 from aqualvs.report.html import Card
 from aqualvs.terminal import Echo
 from aqualvs.text import count_text, laser_colour
-
-# Pictures on the page, each with its corners and stripes drawn over it.
-_N_SHOTS = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,18 +74,17 @@ class LasersRequest:
     wavelength_nm: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Target:
+class _Target(NamedTuple):
     """Target that the lasers shine on."""
 
     name: str  # In messages.
     surfaces: TargetSurfaces
-    found: DetectedTargets
+    found: common.DetectedTargets
     n_medium: float  # Refractive index outside the dome.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LasersResult(Calibration[LaserCalibration]):
+class LasersResult(common.Calibration[LaserCalibration]):
     """Result of `calibrate_lasers`."""
 
     n_medium: float  # Refractive index outside the dome in the pictures.
@@ -120,7 +93,7 @@ class LasersResult(Calibration[LaserCalibration]):
 
 
 def calibrate_lasers(
-    pictures: Pictures,
+    pictures: common.Pictures,
     rig: Rig | str | Path,
     *,
     box: MarkerSet | str | Path | None = None,
@@ -173,22 +146,25 @@ def calibrate_lasers(
     before = _with_wavelength(before, wavelength_nm)
     wavelength_nm = _wavelength(wavelength_nm, before)
     target = _detected(pictures, before, box, board, medium, board_offset)
-    check_same_size(before, target.found)
+    common.check_same_size(before, target.found)
+    options = UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
     views = tuple(
-        LaserView(view, _stripes(picture, view.name, wavelength_nm))
+        LaserView(view, find_stripes(common.read_colour(picture), options))
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
     elsewhere = medium is not None or before.is_air(target.n_medium)
-    expected = len(names) if n_lasers is None and names is not None else n_lasers
-    with counting_missed(target.found):
+    planned = None if before.lasers else before.solved_from.get(common.N_LASERS)
+    if n_lasers is None and names is not None:
+        n_lasers = len(names)
+    elif n_lasers is None and isinstance(planned, int):
+        n_lasers = planned
+    with common.counting_missed(target.found):
         result = solve_lasers(
             before,
             views,
             target.surfaces,
             options=LaserOptions(
-                n_lasers=_planned_count(before) if expected is None else expected,
-                n_medium=target.n_medium if elsewhere else None,
-                refine=refine,
+                n_lasers=n_lasers, n_medium=target.n_medium if elsewhere else None, refine=refine
             ),
             uncertainty=_camera_uncertainty(before, refine=refine, elsewhere=elsewhere),
         )
@@ -217,7 +193,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     check_rig_place(request.out)
     before = _with_wavelength(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
     done = calibrate_lasers(
-        picture_paths(request.images),
+        common.picture_paths(request.images),
         before,
         box=request.box,
         board=request.board,
@@ -236,7 +212,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_laser_text(figures, laser))
     page = _page(before, done, request)
-    finish(done.rig, page, request.out, "lasers", echo, comments_of=request.rig)
+    common.finish(done.rig, page, request.out, "lasers", echo, request.rig)
 
 
 def _camera_uncertainty(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:
@@ -250,8 +226,8 @@ def _camera_uncertainty(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncert
     if refine:
         return own
     known = completed_uncertainty(rig)
-    left_out = {"n_water"} - set(own.names) if elsewhere else set()
-    return known.only([name for name in known.names if name not in left_out])
+    left_out = elsewhere and "n_water" not in own.names
+    return known.only([name for name in known.names if not (left_out and name == "n_water")])
 
 
 def _assumed(rig: Rig) -> list[str]:
@@ -289,20 +265,14 @@ def _wavelength(given: float | None, rig: Rig) -> float | None:
         if not LASER_NM[0] <= given <= LASER_NM[1]:
             raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
         return given
-    planned = rig.solved_from.get(WAVELENGTH_NM)
+    planned = rig.solved_from.get(common.WAVELENGTH_NM)
     if not rig.lasers and isinstance(planned, int | float):
         return float(planned)
     return common_wavelength(rig.lasers)
 
 
-def _planned_count(rig: Rig) -> int | None:
-    """Return the planned number of lasers of a rig without lasers; None otherwise."""
-    planned = rig.solved_from.get(N_LASERS)
-    return planned if isinstance(planned, int) and not rig.lasers else None
-
-
 def _detected(
-    pictures: Pictures,
+    pictures: common.Pictures,
     rig: Rig,
     box: MarkerSet | str | Path | None,
     board: Board | str | Path | None,
@@ -319,31 +289,26 @@ def _detected(
         if n_nominal is not None:
             # Air or the rig's own water, whichever is nearer to the index in the box's file.
             default = min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
-        found = detect_targets(
+        found = common.detect_targets(
             pictures,
             lambda one, image: detect_markers(image, markers, one),
-            path_text(box, "the box"),
+            common.path_text(box, "the box"),
         )
-        return _Target(named(box, "the box"), surfaces, found, medium_index(medium, rig, default))
+        return _Target(
+            common.named(box, "the box"), surfaces, found, common.medium_index(medium, rig, default)
+        )
     assert board is not None
-    found = detect_boards(pictures, board)
-    n_medium = medium_index(medium, rig, rig.n_water)
+    found = common.detect_boards(pictures, board)
+    n_medium = common.medium_index(medium, rig, rig.n_water)
     surface = board_surface(thickness=board_offset)
-    return _Target(named(board, "the board"), surface, found, n_medium)
-
-
-def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> StripePoints:
-    found = find_stripes(
-        read_colour(picture), UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
-    )
-    return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
+    return _Target(common.named(board, "the board"), surface, found, n_medium)
 
 
 def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
     """Return the solved rig with its covariance and a note of this step."""
     old = rig_uncertainty(before)
-    assumed = [name for name in result.uncertainty.names if ":" not in name]
-    assumed = [file_parameter_name(name) for name in assumed if name not in old.names]
+    new = [name for name in result.uncertainty.names if name not in old.names]
+    assumed = [file_parameter_name(name) for name in new if ":" not in name]
     step = SolvedStep(
         pictures=len(result.views),
         points=sum(figures.n_points for figures in result.lasers),
@@ -412,7 +377,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
     assert target is not None
     used = {one.name for one in result.views}
     seen = zip(done.views, found.pictures, strict=True)
-    shown = (pair for pair in seen if pair[0].view.name in used)
+    shown = (_shot(view, picture) for view, picture in seen if view.view.name in used)
     rows = [
         ViewRow(
             name=one.name,
@@ -425,6 +390,11 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         for one in result.views
     ]
     worst = max(figures.sigma_normal for figures in result.lasers)
+    known = rig_uncertainty(rig)
+    refined = [name for name in known.names if ":" not in name]
+    each = list(zip(result.lasers, rig.lasers, strict=True))
+    # Pictures on the page, each with its corners and stripes drawn over it.
+    n_shots = 6
     return CalibrationPage(
         title="Calibration of the lasers",
         subtitle=f"Rig “{rig.name}”, {target.name}, index outside {done.n_medium:.4f}",
@@ -442,46 +412,30 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             *(f"{name}: {why}" for name, why in result.left_out.items()),
             *found.remarks,
         ),
-        words=tuple(
-            _laser_text(figures, laser)
-            for figures, laser in zip(result.lasers, rig.lasers, strict=True)
-        ),
+        words=tuple(_laser_text(*one) for one in each),
         expectations=expectations(rig),
-        lasers=tuple(
-            _laser_row(figures, laser, before)
-            for figures, laser in zip(result.lasers, rig.lasers, strict=True)
-        ),
-        parameters=_refined_rows(before, rig) if result.refined else (),
+        lasers=tuple(_laser_row(*one, before) for one in each),
+        parameters=parameter_rows(rig, known, refined, before) if result.refined else (),
         residual_maps=(
             residual_map(
                 "Corners of the target",
                 rig.size_px,
-                [_corners_of(one.name, one.corners_px) for one in result.views],
+                [one.corners for one in result.views],
                 [one.corner_residuals_px for one in result.views],
                 [one.corner_inliers for one in result.views],
             ),
         ),
         views=(*rows, *missed_rows(found.missed)),
         # Pictures are not kept in memory: those on the page are read again.
-        pictures=tuple(_shot(view, picture) for view, picture in islice(shown, _N_SHOTS)),
+        pictures=tuple(islice(shown, n_shots)),
         facts=facts(("rig before", str(request.rig)), ("target", str(target))),
     )
 
 
-def _refined_rows(before: Rig, rig: Rig) -> tuple[ParameterRow, ...]:
-    uncertainty = rig_uncertainty(rig)
-    names = [name for name in uncertainty.names if ":" not in name]
-    return parameter_rows(rig, uncertainty, names, before)
-
-
-def _corners_of(name: str, pixels: FloatArray) -> View:
-    return View(name, np.arange(len(pixels)), np.zeros((len(pixels), 3)), pixels)
-
-
-def _shot(view: LaserView, picture: Picture) -> PictureShot:
+def _shot(view: LaserView, picture: common.Picture) -> PictureShot:
     return PictureShot(
         caption=view.view.name,
-        image=read_colour(picture),
+        image=common.read_colour(picture),
         points=(
             Overlay(pixels=view.view.pixels, colour="#ff9800", kind="circle", label="corners"),
             Overlay(

@@ -82,7 +82,8 @@ class _Warp(NamedTuple):
     The three components are range, pitch and yaw; residuals are divided by their noise.
     """
 
-    scan: Scan
+    i_scan: int  # Index of the frame's scan.
+    time: float  # In seconds.
     matrix: FloatArray  # Shape (3, 3).
     right: FloatArray  # Shape (3,).
 
@@ -90,31 +91,21 @@ class _Warp(NamedTuple):
 def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
     """Estimate the readout of a rolling shutter.
 
-    Parameters
-    ----------
-    source : FrameSource
-        A dive in which the vehicle turns before a flat target.
-    rig : Rig
-        Rig with lasers; its own readout is not used.
-
-    Raises
-    ------
-    CalibrationError
-        If the dive has too few postures, or too little motion.
-    SourceError
-        If the pictures do not fit the rig, or cannot be read.
+    In the dive the vehicle turns before a flat target; the rig's own readout is not used. Raises
+    `CalibrationError` if the dive has too few postures, or too little motion, and `SourceError` if
+    the pictures do not fit the rig, or cannot be read.
     """
     check_fits(source, rig)
     nominal = Shutter(kind=ShutterKind.ROLLING, readout=_NOMINAL)
     scanner = Scanner(replace(rig, shutter=nominal))
     scans: list[Scan] = []
-    warps: list[tuple[int, _Warp]] = []
+    warps: list[_Warp] = []
     with progress(f"measuring {source.name}", source.n_frames) as tick:
         for frame in source:
             scan = scanner.process(frame)
-            warp = _warp(scan, rig.size_px[1])
-            if warp is not None:
-                warps.append((len(scans), warp))
+            equations = _warp(scan, rig.size_px[1])
+            if equations is not None:
+                warps.append(_Warp(len(scans), scan.time_s, *equations))
             # The points of a whole dive would not fit into memory.
             scans.append(replace(scan, points=ScanPoints.none()))
             tick(1)
@@ -184,14 +175,14 @@ def run_shutter(request: ShutterRequest, echo: Echo) -> None:
         ),
         facts=facts(("rig before", str(request.rig))),
     )
-    finish(solved, page, request.out, "shutter", echo, comments_of=request.rig)
+    finish(solved, page, request.out, "shutter", echo, request.rig)
 
 
 def _text(found: ShutterCalibration) -> str:
     return f"{1e3 * found.readout:.2f} ± {1e3 * found.sigma:.2f} ms"
 
 
-def _warp(scan: Scan, height: int) -> _Warp | None:
+def _warp(scan: Scan, height: int) -> tuple[FloatArray, FloatArray] | None:
     """Return the normal equations of a frame's warp; None without a posture or noise.
 
     `height` is the number of rows of the picture.
@@ -215,10 +206,10 @@ def _warp(scan: Scan, height: int) -> _Warp | None:
     if not noise > 0.0:
         return None
     sums = both.T @ both / noise**2
-    return _Warp(scan, sums[1:, 1:], sums[1:, 0])
+    return sums[1:, 1:], sums[1:, 0]
 
 
-def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> ShutterCalibration:
+def _solve(scans: Sequence[Scan], warps: Sequence[_Warp]) -> ShutterCalibration:
     """Return the readout that explains the warps, with a sigma from the parts of the dive."""
     readout = 0.0
     # Rates depend on the readout; each iteration reduces the error by a factor of ten or more.
@@ -229,7 +220,7 @@ def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> Shutter
         rights = np.array([right for _, right in equations])
         inverse = np.linalg.pinv(matrices.sum(axis=0))
         readout = float(np.clip(inverse[0] @ rights.sum(axis=0), -1.0, 1.0))
-    times = np.array([warp.scan.time_s for _, warp in warps])
+    times = np.array([warp.time for warp in warps])
     n_parts = max(round(float(np.ptp(times)) / _PART_S), _MIN_PARTS)
     share = np.arange(len(warps)) * n_parts // len(warps)
     # Jackknife: the readout without each of the parts (Efron and Stein 1981).
@@ -251,14 +242,15 @@ def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> Shutter
 
 
 def _equations(
-    scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]], readout: float
+    scans: Sequence[Scan], warps: Sequence[_Warp], readout: float
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield the normal equations (5, 5) and (5,) of each frame, with rates for a readout.
 
     The unknowns are the readout, the warp by the change of range, and the static warp (3).
     """
     scaled = [_with_readout(scan, readout) for scan in scans]
-    for i, warp in warps:
+    for warp in warps:
+        i = warp.i_scan
         beside = [*scaled[max(i - REACH, 0) : i], *scaled[i + 1 : i + 1 + REACH]]
         motion, _ = motion_beside(scaled[i], beside)
         of_range, of_pitch, of_yaw = motion[:3].tolist()

@@ -12,12 +12,13 @@ Alignments"). Only detected peaks are added, and no line begins without a certai
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from aqualvs.calibration.lasers.stripes_on_planes import StripePoints
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, pixels_per_line
@@ -57,19 +58,11 @@ class UncalibratedStripeOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class StripePixels:
+class StripePixels(StripePoints):
     """Points on stripes of a picture, N of them, ordered along each unbroken chain."""
 
-    pixels: FloatArray  # Shape (N, 2): sub-pixel centres, in `image`.
-    across: FloatArray  # Shape (N, 2): unit vectors perpendicular to the stripe, in `image`.
-    chain: IntArray  # Shape (N,): number of the unbroken chain that a point belongs to.
     height: FloatArray  # Shape (N,): peak above background, in grey levels.
     width: FloatArray  # Shape (N,): full width at half height across the stripe, in pixels.
-    sigma_px: FloatArray  # Shape (N,): nominal standard deviation of the centre across the stripe.
-
-    def __len__(self) -> int:
-        """Return the number of points."""
-        return len(self.chain)
 
 
 def find_stripes(
@@ -77,17 +70,9 @@ def find_stripes(
 ) -> StripePixels:
     """Find laser lines: thin, long, of the lasers' colour, and similar to each other.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width) or (height, width, 3), or Frame
-        Grey, or BGR as OpenCV reads it. In a grey picture every thin bright line counts.
-    options : UncalibratedStripeOptions, optional
-
-    Returns
-    -------
-    StripePixels
-        Each segment is searched along the axis that crosses it at the larger angle. Empty if no
-        segment is certain.
+    The picture is grey (height, width), or BGR as OpenCV reads it (height, width, 3); in a grey one
+    every thin bright line counts. Each segment is searched along the axis that crosses it at the
+    larger angle. Empty if no segment is certain.
     """
     options = options or UncalibratedStripeOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
@@ -108,32 +93,37 @@ def find_stripes(
             points = _pixels_of(segments.search, segments.peaks, chain)
             lines.setdefault(int(number), []).append(points)
         first = here.stop
-    stripes = _concatenated([chain for one in lines.values() for chain in _unless_blob(one)])
+    chains = [chain for one in lines.values() for chain in _unless_blob(one)]
+    # Chains are numbered consecutively.
+    none = np.zeros(0)
+    places = none.reshape(0, 2)
+    each = [StripePixels(places, places, none.astype(np.int64), none, none, none)]
+    each += [replace(one, chain=np.full(len(one), i)) for i, one in enumerate(chains)]
+    names = [field.name for field in fields(StripePixels)]
+    stripes = StripePixels(
+        *(np.concatenate([getattr(one, name) for one in each]) for name in names)
+    )
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 
 def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[StripeSegments]:
     """Find the segments of all lines, laser light or not, one set for each search axis.
 
-    Parameters
-    ----------
-    frame : Frame
-    options : UncalibratedStripeOptions
-        Of these, the wavelength selects the channel in which lines are brightest.
+    Of the options, the wavelength selects the channel in which lines are brightest.
     """
     size_px = frame.luma.shape[1], frame.luma.shape[0]
-    colour = LaserColour.of(options.wavelength_nm)
-    return [find_segments(frame, _whole_band(size_px, axis, colour)) for axis in SearchAxis]
-
-
-def _whole_band(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> LaserBand:
-    """Return a band that covers the whole picture, for slopes up to `_MAX_SLOPE`."""
-    line_px = pixels_per_line(size_px)
-    n_pixels, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
-    n_lines = n_pixels // line_px
-    slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _MAX_SLOPE * line_px)
-    lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
-    return LaserBand(axis, line_px, lowest, highest, -slopes, slopes, colour)
+    colour, line_px = LaserColour.of(options.wavelength_nm), pixels_per_line(size_px)
+    found = []
+    for axis in SearchAxis:
+        # A band that covers the whole picture, for slopes up to `_MAX_SLOPE`.
+        n_pixels, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
+        n_lines = n_pixels // line_px
+        cells = -(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)
+        slopes = np.full(cells, _MAX_SLOPE * line_px)
+        lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
+        band = LaserBand(axis, line_px, lowest, highest, -slopes, slopes, colour)
+        found.append(find_segments(frame, band))
+    return found
 
 
 def _pixels_of(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixels:
@@ -150,14 +140,16 @@ def _pixels_of(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> Stripe
     cosine = 1.0 / np.hypot(1.0, slope)
     pixels = np.stack([line, peaks.position[chain]], axis=-1)
     across = np.stack([-slope * cosine, cosine], axis=-1)
-    width = _unsmoothed(peaks.width[chain], slope * search.line_px) * cosine
+    # Without the broadening by smoothing along slanted stripes.
+    width, added = peaks.width[chain], _WIDTH_OF_SIGMA * SMOOTHING * (slope * search.line_px)
+    width = np.sqrt(np.maximum(width**2 - added**2, (0.5 * width) ** 2)) * cosine
     return StripePixels(
         pixels[:, ::-1] if along_x else pixels,
         across[:, ::-1] if along_x else across,
         np.zeros(len(chain), np.int64),
+        np.zeros(len(chain)),
         peaks.height[chain],
         width,
-        np.zeros(len(chain)),
     )
 
 
@@ -174,13 +166,6 @@ def _in_dot(width: FloatArray, line_px: int) -> BoolArray:
         if line_px * (end - first) > longest_dot * np.median(width[first:end]):
             wide[first:end] = False
     return wide
-
-
-def _unsmoothed(width: FloatArray, slope: FloatArray) -> FloatArray:
-    """Return widths (N,), in pixels, without the broadening by smoothing along slanted stripes."""
-    added = _WIDTH_OF_SIGMA * SMOOTHING * slope
-    squared: FloatArray = np.maximum(width**2 - added**2, (0.5 * width) ** 2)
-    return np.sqrt(squared)
 
 
 def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:
@@ -246,19 +231,6 @@ def _unless_blob(line: list[StripePixels]) -> list[StripePixels]:
     return chains if length >= min_length_in_widths * float(width) else []
 
 
-def _concatenated(chains: list[StripePixels]) -> StripePixels:
-    """Return the points of all chains, with the chains numbered consecutively."""
-    none = np.zeros(0)
-    empty = StripePixels(
-        none.reshape(0, 2), none.reshape(0, 2), none.astype(np.int64), none, none, none
-    )
-    numbered = [replace(one, chain=np.full(len(one), i)) for i, one in enumerate(chains)]
-    names = StripePixels.__slots__
-    return StripePixels(
-        *(np.concatenate([getattr(one, name) for one in (empty, *numbered)]) for name in names)
-    )
-
-
 class _Window(NamedTuple):
     """Window beyond the end of a line in which the line may continue."""
 
@@ -300,6 +272,9 @@ def continued(
 ) -> IntArray:
     """Find the segments of lines: long and likely ones, and others that continue these.
 
+    Returns the number (P,) of the line that each segment belongs to, or -1. A line may have
+    segments of both search axes.
+
     Parameters
     ----------
     found : list of StripeSegments
@@ -310,12 +285,6 @@ def continued(
         Log odds and length from which on a segment is a line by itself.
     size_px : tuple of int
         Width and height of the picture.
-
-    Returns
-    -------
-    line : int array, shape (P,)
-        Number of the line that a segment belongs to, or -1. A line may have segments of both search
-        axes.
     """
     length = np.concatenate([segments.table[LENGTH] for segments in found])
     pool = np.flatnonzero(log_odds >= least - _MAX_SHORTFALL)
@@ -359,12 +328,17 @@ def _next_segment(
     max_false_alarms = 0.01
     ahead, way_px, near = _ahead(ends, a, end)
     turn = _turn(ends.outward[a, end], ends.outward[by_chance, 1])
+    half_px = _WINDOW.half_px + _WINDOW.n_sigmas * float(ends.sigma_px[a, end])
+    widening = _WINDOW.widening + _WINDOW.n_sigmas * float(ends.sigma_rad[a, end])
     for b in ahead[np.argsort(way_px[ahead])]:
         turn_rad = _turn_limit(ends.sigma_rad[a, end], ends.sigma_rad[b, near[b]])
         others = (log_odds[by_chance] >= log_odds[b]) & (turn <= turn_rad)
         # One at least, so that windows do not reach across a picture with little else in it.
         n = max(int(np.count_nonzero(others)), 1)
-        if n / area_px * _window_px(ends, a, end, way_px[b]) <= max_false_alarms:
+        # Area of the window up to the segment, in square pixels.
+        far_px = max(way_px[b], 1.0)
+        window_px = (2.0 * half_px + widening * far_px) * far_px
+        if n / area_px * window_px <= max_false_alarms:
             return int(b)
         if in_line[b]:
             break
@@ -398,14 +372,6 @@ def _turn(along: FloatArray, others: FloatArray) -> FloatArray:
 
 def _turn_limit(one_rad: FloatArray, other_rad: FloatArray) -> FloatArray:
     return _WINDOW.turn_rad + _WINDOW.n_sigmas * np.hypot(one_rad, other_rad)
-
-
-def _window_px(ends: _Ends, a: int, end: int, way_px: float) -> float:
-    """Return the area of the window of an end up to a distance, in square pixels."""
-    way_px = max(way_px, 1.0)
-    half_px = _WINDOW.half_px + _WINDOW.n_sigmas * float(ends.sigma_px[a, end])
-    widening = _WINDOW.widening + _WINDOW.n_sigmas * float(ends.sigma_rad[a, end])
-    return (2.0 * half_px + widening * way_px) * way_px
 
 
 def _ends(found: list[StripeSegments], pool: IntArray) -> _Ends:
@@ -455,24 +421,13 @@ def _fit_ends(line: FloatArray, position: FloatArray, ends: _Ends, i: int) -> No
 def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
     """Return the chains of peaks of some segments, extended by the peaks beyond their ends.
 
-    A segment ends at a kink or a gap; a few peaks beyond may still belong to the line.
-
-    Parameters
-    ----------
-    segments : StripeSegments
-    keep : bool array, shape (P,)
-        True for the segments that are lines.
-
-    Returns
-    -------
-    chains : list of int array
-        Indices of peaks along each segment.
+    A segment ends at a kink or a gap; a few peaks beyond may still belong to the line. `keep` (P,)
+    marks the segments that are lines; chains are indices of peaks along each.
     """
     peaks = segments.peaks
     first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))
-    chains = [
-        segments.order[segments.start[k] : segments.start[k + 1]] for k in np.flatnonzero(keep)
-    ]
+    bounds = zip(segments.start[:-1][keep], segments.start[1:][keep], strict=True)
+    chains = [segments.order[start:end] for start, end in bounds]
     used = np.zeros(peaks.n, bool)
     for chain in chains:
         used[chain] = True

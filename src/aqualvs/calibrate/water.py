@@ -2,22 +2,12 @@
 
 import glob
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from aqualvs.calibrate.common import (
-    Calibration,
-    DetectedTargets,
-    Picture,
-    check_same_size,
-    detect_targets,
-    finish,
-    named,
-    path_text,
-    picture_paths,
-)
+from aqualvs.calibrate import common
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.targets.target_files import load_target
 from aqualvs.calibration.targets.targets import MarkerSet, View
@@ -58,21 +48,18 @@ class WaterRequest:
     turn_sigma_deg: float
 
     def __post_init__(self) -> None:
-        """Refuse negative deviations.
-
-        Raises `OptionError` naming the option and its value.
-        """
+        """Raise `OptionError` for negative deviations."""
         check_options(self, "place_sigma_mm", "turn_sigma_deg", least=0.0, wanted="0 or more")
 
 
 def calibrate_water(
-    pictures: Sequence[Picture] | str | Path | FrameSource,
+    pictures: Sequence[common.Picture] | str | Path | FrameSource,
     target: MarkerSet | str | Path,
     rig: Rig | str | Path,
     *,
     prior: IndexPrior | None = None,
     options: IndexOptions | None = None,
-) -> Calibration[WaterCalibration]:
+) -> common.Calibration[WaterCalibration]:
     """Estimate the water's index from pictures of markers that are fixed to the vehicle.
 
     Parameters
@@ -103,12 +90,12 @@ def calibrate_water(
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
     markers = target if isinstance(target, MarkerSet) else load_target(target)
     if isinstance(pictures, Sequence | Path):
-        found = detect_targets(
+        found = common.detect_targets(
             pictures,
             lambda name, image: detect_markers(image, markers, name),
-            path_text(target, "the target"),
+            common.path_text(target, "the target"),
         )
-        check_same_size(before, found)
+        common.check_same_size(before, found)
         times = None
     else:
         found, times = _found_in(pictures, markers, before, target)
@@ -120,8 +107,15 @@ def calibrate_water(
         prior=prior,
         options=options or IndexOptions(),
     )
-    _check_observable(result)
-    return Calibration(
+    if not result.observable and not any(reading.prior_used for reading in result.readings):
+        why = "; ".join(result.remarks) or (
+            "the lens is too near the centre of the dome; give temperature and salinity"
+        )
+        raise CalibrationError(
+            f"the index is known to {result.sigma:.2g} only: {why}; see --temperature-c "
+            "and --salinity"
+        )
+    return common.Calibration(
         rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,
         residuals_px=result.residuals,
@@ -155,15 +149,15 @@ def run_water(request: WaterRequest, echo: Echo) -> None:
     for line in done.notes:
         echo(line)
     page = _page(done.rig, result, prior, request)
-    finish(done.rig, page, request.out, "water", echo, comments_of=request.rig)
+    common.finish(done.rig, page, request.out, "water", echo, request.rig)
 
 
 def _found_in(
     source: FrameSource, markers: MarkerSet, rig: Rig, target: object
-) -> tuple[DetectedTargets, list[float]]:
+) -> tuple[common.DetectedTargets, list[float]]:
     """Return the markers found in the frames of a source, and the times of those frames."""
     check_fits(source, rig)
-    name = named(target, "the target")
+    name = common.named(target, "the target")
     views, times, missed = [], [], {}
     with progress(f"looking for {name}", source.n_frames) as tick:
         for frame in source:
@@ -177,22 +171,10 @@ def _found_in(
             tick(1)
     if not views:
         raise CalibrationError(
-            f"{target if isinstance(target, str | Path) else name}: its markers are in no picture "
+            f"{common.path_text(target, 'the target')}: its markers are in no picture "
             f"of {source.name}; check its family and ids, and that the camera sees the target sharp"
         )
-    return DetectedTargets(tuple(views), (), rig.size_px, missed), times
-
-
-def _check_observable(result: WaterCalibration) -> None:
-    """Raise `CalibrationError` if neither the pictures nor a prior determine the index."""
-    if not result.observable and not any(reading.prior_used for reading in result.readings):
-        why = "; ".join(result.remarks) or (
-            "the lens is too near the centre of the dome; give temperature and salinity"
-        )
-        raise CalibrationError(
-            f"the index is known to {result.sigma:.2g} only: {why}; see --temperature-c "
-            "and --salinity"
-        )
+    return common.DetectedTargets(tuple(views), (), rig.size_px, missed), times
 
 
 def _source(request: WaterRequest) -> FrameSource:
@@ -202,7 +184,7 @@ def _source(request: WaterRequest) -> FrameSource:
     # Pictures carry no times.
     default_fps = 25.0
     if several or Path(first).suffix.lower() in IMAGE_SUFFIXES:
-        return ImageSource(picture_paths(request.source), fps=request.fps or default_fps)
+        return ImageSource(common.picture_paths(request.source), fps=request.fps or default_fps)
     fps = request.fps or (default_fps if Path(first).is_dir() else None)
     return open_source(first, fps=fps)
 
@@ -224,43 +206,38 @@ def _page(
 ) -> CalibrationPage:
     counted = [reading for reading in result.readings if reading]
     times = np.array([reading.time for reading in counted])
+    random = f"{result.sigma_random:.1e}"
     marks = tuple((step.time, f"{step.size:+.4f}") for step in result.steps)
     level = None if prior is None else (prior.source, prior.n)
+    course = Series(
+        title="Index of each picture, with its own noise",
+        x_label="time, s",
+        y_label="index",
+        x=times,
+        y=np.array([reading.n_frame for reading in counted]),
+        sigma=np.array([reading.sigma_frame for reading in counted]),
+        marks=marks,
+    )
     return CalibrationPage(
         title="Calibration of the water",
         subtitle=f"Rig “{rig.name}”, {' '.join(request.source[:3])}",
         cards=(
             Card("index", f"{result.n:.5f}", f"± {result.sigma:.5f}"),
-            Card(
-                "random part",
-                f"{result.sigma_random:.1e}",
-                "of this sigma; less with more pictures",
-            ),
+            Card("random part", random, "of this sigma; less with more pictures"),
             Card("pictures", str(len(counted)), f"{result.rms_px:.3f} px rms"),
         ),
         warnings=tuple(step.text() for step in result.steps),
         words=result.remarks,
         expectations=expectations(rig),
         series=(
-            Series(
+            replace(
+                course,
                 title="Index, from all pictures so far",
-                x_label="time, s",
-                y_label="index",
-                x=times,
                 y=np.array([reading.n for reading in counted]),
                 sigma=np.array([reading.sigma for reading in counted]),
                 level=level,
-                marks=marks,
             ),
-            Series(
-                title="Index of each picture, with its own noise",
-                x_label="time, s",
-                y_label="index",
-                x=times,
-                y=np.array([reading.n_frame for reading in counted]),
-                sigma=np.array([reading.sigma_frame for reading in counted]),
-                marks=marks,
-            ),
+            course,
         ),
         views=missed_rows({one.name: one.refused for one in result.readings if not one}),
         facts=facts(("rig before", str(request.rig)), ("target", str(request.target))),

@@ -58,7 +58,7 @@ def check(result: LaserCalibration, rig: Rig, *, sigmas: float = 5.0) -> None:
 
 
 def kept(views: list[LaserView], keep: Callable[[LaserView], BoolArray]) -> list[LaserView]:
-    return [replace(v, stripes=v.stripes.where(keep(v))) for v in views]
+    return [replace(v, stripes=v.stripes.at(np.flatnonzero(keep(v)))) for v in views]
 
 
 def test_lasers_come_out_of_a_box() -> None:

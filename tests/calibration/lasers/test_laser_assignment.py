@@ -42,7 +42,6 @@ def with_junk(view: LaserView, n: int, seed: int) -> LaserView:
     angle = rng.uniform(0.0, np.pi, n)
     s = view.stripes
     stripes = StripePoints(
-        s.name,
         np.concatenate([s.pixels, rng.uniform((0.0, 0.0), RIG.size_px, (n, 2))]),
         np.concatenate([s.across, np.stack([np.cos(angle), np.sin(angle)], axis=-1)]),
         np.concatenate([s.chain, np.full(n, 1000)]),
@@ -147,7 +146,7 @@ def test_stripes_on_one_surface_alone_stay_unmatched() -> None:
     for view, first in zip(views, (True, False, False), strict=True):
         chain = view.stripes.chain
         keep = (chain < 2 * n) | (first & (chain == 2 * n + 2))
-        kept.append(replace(view, stripes=view.stripes.where(keep)))
+        kept.append(replace(view, stripes=view.stripes.at(np.flatnonzero(keep))))
     split = assign_lasers(placed(kept, box()), LENS, n_lasers=3)
     assert len(split.planes) == 2
     assert [line.patch for line in split.unmatched] == [2]

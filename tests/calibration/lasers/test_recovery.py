@@ -9,7 +9,7 @@ import pytest
 from aqualvs.calibrate.uncalibrated_stripes import find_stripes
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
-from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, board_surface, box_surfaces
+from aqualvs.calibration.lasers.stripes_on_planes import board_surface, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.geometry.arrays import FloatArray
@@ -82,11 +82,6 @@ def true_rig(folder: Path) -> Rig:
     return load_truth(folder / "truth" / "rig_truth.json")
 
 
-def stripes_of(image: np.ndarray, name: str) -> StripePoints:
-    found = find_stripes(image)
-    return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
-
-
 @pytest.mark.samples
 # In water, by the command: calibration/test_samples.py.
 @pytest.mark.parametrize("folder", ["box", "box_water"] if WHOLE else ["box"])
@@ -99,7 +94,7 @@ def test_lasers_of_the_sample_box(folder: str, samples: Path) -> None:
         assert image is not None
         view = detect_markers(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), markers, path.name)
         assert view, str(view)
-        views.append(LaserView(view, stripes_of(image, path.name)))
+        views.append(LaserView(view, find_stripes(image)))
     assert len(views) == n_views
     options = LaserOptions(n_lasers=3, n_medium=n_medium if folder == "box" else None)
     surfaces = box_surfaces(markers.planes, markers.points())

@@ -77,12 +77,12 @@ def test_stripes_are_placed_where_they_are() -> None:
     pixels, valid = camera.project(pose.apply(true))
     assert valid.all()
     across = np.tile([0.6, 0.8], (3, 1))
-    stripes = StripePoints("a.png", pixels, across, np.zeros(3, np.int64), np.full(3, 0.1))
+    stripes = StripePoints(pixels, across, np.zeros(3, np.int64), np.full(3, 0.1))
     placed = place_stripes(camera, stripes, pose, box())
     assert placed.surface.tolist() == [0, 2, 3]
     np.testing.assert_allclose(pose.inverse().apply(placed.points_in_dome), true, atol=1e-9)
     # A step of a hundredth of a pixel: derivative against difference.
-    stepped = StripePoints("a.png", pixels + 0.01 * across, across, stripes.chain, stripes.sigma_px)
+    stepped = StripePoints(pixels + 0.01 * across, across, stripes.chain, stripes.sigma_px)
     there = place_stripes(camera, stepped, pose, box()).points_in_dome
     difference = (there - placed.points_in_dome) / 0.01
     np.testing.assert_allclose(placed.by_across, difference, rtol=1e-3, atol=1e-7)
@@ -92,11 +92,7 @@ def test_stripes_beside_a_thick_board_lie_behind_its_face() -> None:
     camera = example_rig().camera()
     pose = SE3(example_rig().dome_from_cam.rotation, np.array([0.0, 0.5, 0.0]))
     stripes = StripePoints(
-        "a.png",
-        np.array([[300.0, 250.0]]),
-        np.array([[1.0, 0.0]]),
-        np.zeros(1, np.int64),
-        np.ones(1),
+        np.array([[300.0, 250.0]]), np.array([[1.0, 0.0]]), np.zeros(1, np.int64), np.ones(1)
     )
     placed = place_stripes(camera, stripes, pose, board_surface(thickness=0.005))
     assert pose.inverse().apply(placed.points_in_dome)[0, 2] == pytest.approx(0.005)

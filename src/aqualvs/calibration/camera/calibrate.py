@@ -74,9 +74,9 @@ def check_camera_solution(
             "flat, and that zoom and focus stood still"
         )
     _check_determined(solution, covariance)
-    poses = solution.state.poses
-    away = [np.linalg.norm(p.apply(v.middle)) for p, v in zip(poses, views, strict=True)]
-    fault = implausible_distance(np.array(away), [view.name for view in views])
+    placed = zip(solution.state.poses, views, strict=True)
+    away = np.array([np.linalg.norm(pose.apply(view.middle)) for pose, view in placed])
+    fault = implausible_distance(away, [view.name for view in views])
     if fault is not None:
         raise CalibrationError(fault)
 
@@ -118,23 +118,17 @@ def coverage(pixels: FloatArray, size_px: tuple[int, int]) -> IntArray:
     """Return how many pixels (N, 2) fall into each cell of a grid over the picture."""
     rows, columns = COVERAGE_CELLS
     width, height = size_px
-    counts, _, _ = np.histogram2d(
-        pixels[:, 1] + 0.5,
-        pixels[:, 0] + 0.5,
-        bins=(rows, columns),
-        range=((0.0, height), (0.0, width)),
-    )
-    return counts.astype(np.int64)
+    y, x = pixels[:, 1] + 0.5, pixels[:, 0] + 0.5
+    extent = ((0.0, height), (0.0, width))
+    return np.histogram2d(y, x, bins=(rows, columns), range=extent)[0].astype(np.int64)
 
 
 def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
     """Return the pixels (N, 2) of a grid over the picture, borders included."""
     rows, columns = COVERAGE_CELLS
-    u, v = np.meshgrid(
-        np.linspace(0.0, size_px[0] - 1.0, columns + 1),
-        np.linspace(0.0, size_px[1] - 1.0, rows + 1),
-    )
-    return np.stack([u.ravel(), v.ravel()], axis=-1)
+    u = np.linspace(0.0, size_px[0] - 1.0, columns + 1)
+    v = np.linspace(0.0, size_px[1] - 1.0, rows + 1)
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,20 +168,10 @@ def camera(
 ) -> CameraCalibration:
     """Solve the intrinsics.
 
-    Parameters
-    ----------
-    views : sequence of View
-        Of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of them.
-    size_px : (int, int)
-        Image width and height.
-    n_coefficients : int, optional
-        Number of distortion coefficients; by default as many as the views support.
-
-    Raises
-    ------
-    CalibrationError
-        If the views are too few or too much alike to determine the intrinsics, or do not show the
-        given board.
+    `views` are of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of
+    them; `size_px` is the image's width and height. By default the lens has as many distortion
+    coefficients as the views support. Raises `CalibrationError` if the views are too few or too
+    much alike to determine the intrinsics, or do not show the given board.
     """
     check_camera_views(views, size_px)
     bundle, solution = fitted_camera(views, size_px, model, n_coefficients)
@@ -280,9 +264,7 @@ def _result(
 
 def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
     # One view out of this number is held out; least number of views and of corners in one for that.
-    folds = 4
-    min_views = 8
-    min_points = 12
+    folds, min_views, min_points = 4, 8, 12
     n = len(bundle.views)
     believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
     held_out = [i for i in range(1, n, folds) if len(believed[i]) >= min_points]
@@ -291,9 +273,8 @@ def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
     rest = [i for i in range(n) if i not in held_out]
     try:
         state = solve(bundle.only(rest), solution.state.only(rest)).state
-        errors = np.concatenate(
-            predicted(state, [0] * len(held_out), [believed[i] for i in held_out])
-        )
+        views = [believed[i] for i in held_out]
+        errors = np.concatenate(predicted(state, [0] * len(views), views))
         return rms_px(errors[np.isfinite(errors).all(axis=1)])
     except CalibrationError:
         return float("nan")
@@ -330,14 +311,13 @@ def _odd_views(result: CameraCalibration) -> list[str]:
     rms = [fit.rms_px for fit in result.views]
     # Half of the pictures may be turned.
     typical = float(np.quantile(rms, 0.25))
-    odd = [
-        (fit.label, one)
+    names = ", ".join(
+        f"{fit.label} ({one:.2g} px)"
         for fit, one in zip(result.views, rms, strict=True)
         if one > max(odd_view * typical, odd_noise_px)
-    ]
-    if not odd:
+    )
+    if not names:
         return []
-    names = ", ".join(f"{name} ({one:.2g} px)" for name, one in odd)
     return [
         f"corners of {names} are far more off than those of other views ({typical:.2g} px), and "
         "count for little; turned upside down by the camera, blurred, or the board bent? Leave "
@@ -376,8 +356,7 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
 
 
 def _weak_places(result: CameraCalibration) -> list[str]:
-    weak_pixel_px = 1.0
-    thin_coverage = 0.6
+    weak_pixel_px, thin_coverage = 1.0, 0.6
     lines = []
     covered = float(np.mean(result.coverage > 0))
     if covered < thin_coverage:
@@ -390,7 +369,7 @@ def _weak_places(result: CameraCalibration) -> list[str]:
     if not np.isfinite(sigma).all():
         lines.append("the distortion model does not reach all corners of the picture")
     worst = int(np.argmax(np.nan_to_num(sigma)))
-    if np.nan_to_num(sigma)[worst] > weak_pixel_px:
+    if sigma[worst] > weak_pixel_px:
         u, v = grid[worst]
         lines.append(
             f"at pixel ({u:.0f}, {v:.0f}) the intrinsics are uncertain by {sigma[worst]:.1f} px; "

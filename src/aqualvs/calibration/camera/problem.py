@@ -8,8 +8,10 @@ corners, so the bend is solved together with them, and only if the views show it
 (`bend_is_significant`).
 """
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -85,8 +87,7 @@ class BoardBend:
         return float(np.ptp(off))
 
 
-@dataclass(frozen=True, slots=True)
-class _BentState:
+class _BentState(NamedTuple):
     flat: BundleState
     coefficients: FloatArray
 
@@ -135,8 +136,7 @@ class _BentBundle:
         return replace(self.bundle, views=views)
 
 
-@dataclass(frozen=True, slots=True)
-class BentFit:
+class BentFit(NamedTuple):
     """A bundle solved together with its board's bend."""
 
     bend: BoardBend
@@ -151,16 +151,8 @@ def bend_is_significant(
     """Return whether further terms of a bend exceed the scatter of the views.
 
     From the derivatives at the solution, without solving again: Rao's score, in Wald's test with
-    the covariance by views.
-
-    Parameters
-    ----------
-    bundle : Bundle
-        With points on a flat board, or one bent by terms of lower degree.
-    degree : int
-        Of the terms in question, one of `BEND_DEGREES`.
-    n_solved : int
-        Number of the terms up to that degree that the points include already.
+    the covariance by views. The points include the first `n_solved` of the terms up to `degree`,
+    one of `BEND_DEGREES`, already.
     """
     bend = BoardBend.flat([target.view for target in bundle.views], degree)
     n, n_terms = len(bundle.views), len(bend.exponents) - n_solved
@@ -182,21 +174,9 @@ def bend_is_significant(
 
 
 def fit_bend(flat: Bundle, start: BundleState, degree: int) -> BentFit | None:
-    """Solve a bundle together with a bend that its boards share.
+    """Solve a bundle together with a bend that its boards share; None if no bend helps.
 
-    Parameters
-    ----------
-    flat : Bundle
-        Of views whose poses are free, with the points of the flat board.
-    start : BundleState
-        Initial guess.
-    degree : int
-        Of the polynomial, one of `BEND_DEGREES`.
-
-    Returns
-    -------
-    BentFit or None
-        None where no bend helps to explain the views.
+    `flat` has the points of the flat board, and free poses; `degree` is one of `BEND_DEGREES`.
     """
     bend = BoardBend.flat([target.view for target in flat.views], degree)
     problem = _BentBundle(flat, bend)
@@ -244,8 +224,12 @@ def with_supported_coefficients(
     steps = _STEPS[solution.state.rig.lens.model]
     if len(solution.state.rig.lens.distortion) != steps[0]:
         bundle, solution = with_coefficients(bundle, solution, steps[0])
-    if solution.state.rig.lens.model is LensModel.OPENCV and not _distorts(bundle, solution):
-        return with_coefficients(bundle, solution, 0)
+    lens = solution.state.rig.lens
+    if lens.model is LensModel.OPENCV:
+        columns, values = np.arange(4, 4 + len(lens.distortion)), np.array(lens.distortion)
+        squares = values @ np.linalg.solve(solution.covariance[np.ix_(columns, columns)], values)
+        if not squares > _price(bundle, solution, 0):
+            return with_coefficients(bundle, solution, 0)
     for n in steps[1:]:
         if gain_of_coefficients(bundle, solution, n) < _price(bundle, solution, n):
             break
@@ -285,14 +269,6 @@ def gain_of_coefficients(bundle: Bundle, solution: Solution[BundleState], n: int
     known = values > redundant
     along = (vectors.T @ (slope / size))[known]
     return float(np.sum(along**2 / values[known]))
-
-
-def _distorts(bundle: Bundle, solution: Solution[BundleState]) -> bool:
-    lens = solution.state.rig.lens
-    columns = np.arange(4, 4 + len(lens.distortion))
-    values = np.array(lens.distortion)
-    squares = values @ np.linalg.solve(solution.covariance[np.ix_(columns, columns)], values)
-    return bool(squares > _price(bundle, solution, 0))
 
 
 def _price(bundle: Bundle, solution: Solution[BundleState], n: int) -> float:
@@ -339,9 +315,8 @@ def _lenses(
     views: Sequence[View], size_px: tuple[int, int], model: LensModel, n_coefficients: int
 ) -> Iterator[Lens]:
     if model is LensModel.OPENCV:
-        found = _by_opencv(views, size_px)
-        if found is not None:
-            yield replace(found, distortion=(*found.distortion, *(0.0,) * 4)[:n_coefficients])
+        with contextlib.suppress(cv2.error, RigError):
+            yield _by_opencv(views, size_px, n_coefficients)
     fisheye = model is LensModel.FISHEYE
     for field in _FISHEYE_FIELDS if fisheye else _FIELDS:
         focal = size_px[0] / field if fisheye else 0.5 * size_px[0] / np.tan(0.5 * field)
@@ -355,25 +330,20 @@ def _lenses(
         )
 
 
-def _by_opencv(views: Sequence[View], size_px: tuple[int, int]) -> Lens | None:
-    try:
-        _, matrix, distortion, _, _ = cv2.calibrateCamera(
-            [v.points.astype(np.float32) for v in views],
-            [v.pixels.astype(np.float32) for v in views],
-            size_px,
-            None,
-            None,
-            flags=cv2.CALIB_FIX_K3,
-        )
-        return Lens(
-            fx=float(matrix[0, 0]),
-            fy=float(matrix[1, 1]),
-            cx=float(matrix[0, 2]),
-            cy=float(matrix[1, 2]),
-            distortion=tuple(map(float, np.ravel(distortion)[:4])),
-        )
-    except (cv2.error, RigError):
-        return None
+def _by_opencv(views: Sequence[View], size_px: tuple[int, int], n_coefficients: int) -> Lens:
+    points = [v.points.astype(np.float32) for v in views]
+    pixels = [v.pixels.astype(np.float32) for v in views]
+    _, matrix, distortion, _, _ = cv2.calibrateCamera(
+        points, pixels, size_px, None, None, flags=cv2.CALIB_FIX_K3
+    )
+    coefficients = (*map(float, np.ravel(distortion)[:4]), *(0.0,) * 4)
+    return Lens(
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]),
+        cy=float(matrix[1, 2]),
+        distortion=coefficients[:n_coefficients],
+    )
 
 
 def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bundle:
@@ -400,17 +370,11 @@ def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bund
 
 
 def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Return the uncertainty (N,) of the pixels of fixed directions, in pixels.
+    """Return the uncertainty (N,), in pixels, of the pixels (N, 2) of fixed directions.
 
-    Parameters
-    ----------
-    covariance : array, shape (P, P)
-        Of its parameters.
-    pixels : array, shape (N, 2)
-        Places; the result is NaN where the lens model does not hold.
+    `covariance` (P, P) is that of the lens's parameters. NaN where the lens model does not hold.
     """
-    directions, _ = lens.directions(pixels)
-    _, _, _, by_number = lens.pixels_with_parameter_jacobian(directions)
+    by_number = lens.pixels_with_parameter_jacobian(lens.directions(pixels)[0])[3]
     spread = np.einsum("nip,pq,niq->ni", by_number, covariance, by_number)
     sigma: FloatArray = np.sqrt(spread.sum(axis=-1))
     return sigma

@@ -13,7 +13,7 @@ Both refine corners with `saddle_corners` and reject those that their neighbours
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -78,6 +78,11 @@ class CornerGrid:
     known: BoolArray  # Shape (rows, columns): True for corners that were found.
     notes: tuple[str, ...] = ()  # Remarks for the user on the detection.
 
+    @property
+    def n_known(self) -> int:
+        """Number of corners that were found."""
+        return int(np.count_nonzero(self.known))
+
 
 @dataclass(frozen=True, slots=True)
 class PredictedCorners:
@@ -131,7 +136,12 @@ def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
     normal, right = (np.moveaxis(sums, (0, 1), (-2, -1)) for sums in (normal, right))
     # An affine map needs three neighbours; a fourth guards it.
     min_neighbours = 4
-    valid = (count >= min_neighbours) & _spread_both_ways(normal)
+    # They must span a plane.
+    mass = np.maximum(normal[..., 0, 0], 1e-12)
+    mean = normal[..., 0, 1:] / mass[..., None]
+    spread = normal[..., 1:, 1:] / mass[..., None, None]
+    spread = spread - mean[..., :, None] * mean[..., None, :]
+    valid = (count >= min_neighbours) & (np.linalg.det(spread) > 1e-2)
     safe = np.where(valid[..., None, None], normal, np.eye(3))
     solution = np.linalg.solve(safe, right)
     found = np.where(valid[..., None], solution[..., 0, :], np.nan)
@@ -139,29 +149,13 @@ def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
     return PredictedCorners(found, axes, valid)
 
 
-def _spread_both_ways(normal: FloatArray) -> BoolArray:
-    """Return whether the neighbours of a point span a plane."""
-    mass = np.maximum(normal[..., 0, 0], 1e-12)
-    mean = normal[..., 0, 1:] / mass[..., None]
-    spread = normal[..., 1:, 1:] / mass[..., None, None]
-    spread = spread - mean[..., :, None] * mean[..., None, :]
-    wide: BoolArray = np.linalg.det(spread) > 1e-2
-    return wide
-
-
 def misfits(
     pixels: FloatArray, known: BoolArray, expected: PredictedCorners, *, share: float
 ) -> BoolArray:
     """Return the mask of known points that contradict their neighbours.
 
-    Parameters
-    ----------
-    pixels, known
-        As in `predict`.
-    expected : PredictedCorners
-        What `predict` returns for them.
-    share : float
-        Allowed distance from the prediction, in sides of a square.
+    `expected` is what `predict` returns for them, `share` the allowed distance from the prediction,
+    in sides of a square.
     """
     side = np.sqrt(np.min(np.sum(np.square(expected.axes), axis=-2), axis=-1))
     distance = np.linalg.norm(pixels - expected.pixels, axis=-1)
@@ -219,18 +213,6 @@ _FINDERS: tuple[tuple[str, _Finder], ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Attempt:
-    """A grid confirmed by the picture; `first_is_light` refers to the picture's orientation."""
-
-    grid: CornerGrid
-    first_is_light: bool
-
-    @property
-    def n_known(self) -> int:
-        return int(np.count_nonzero(self.grid.known))
-
-
 def find_chessboard(image: GreyImage, board: Board) -> CornerGrid:
     """Find the inner corners of a chessboard.
 
@@ -247,32 +229,28 @@ def find_chessboard(image: GreyImage, board: Board) -> CornerGrid:
     Such a board exists in two prints, with a dark or with a light first square; both are taken,
     and the grid's notes say so.
     """
-    best, used = _Attempt(nothing_known(board), first_is_light=False), ""
+    best, first_is_light, used = nothing_known(board), False, ""
     # Share of the corners that must be confirmed by the picture to stop trying finders.
     enough = 0.8
     for name, rough in _rough_grids(image, board.corner_grid):
-        found = _borne_out(image, rough)
+        found, is_light = _borne_out(image, rough)
         if found.n_known > best.n_known:
-            best, used = found, name
+            best, first_is_light, used = found, is_light, name
         if best.n_known >= enough * board.n_corners:
             break
     if not best.n_known:
-        return nothing_known(board)
-    grid, first_is_light = _in_board_order(best)
+        return best
+    grid, first_is_light = _in_board_order(best, first_is_light=first_is_light)
     notes = []
     if used != _FINDERS[0][0]:
         notes.append(f"board found at a later try (OpenCV's {used})")
     if first_is_light:
-        notes.append(_other_print(board))
-    return CornerGrid(grid.pixels, grid.known, tuple(notes))
-
-
-def _other_print(board: Board) -> str:
-    n_x, n_y = board.corner_grid
-    return (
-        f"the first square of the print is light, as on a board of {n_y} x {n_x} inner corners; "
-        f"taken as the same board, with x along the {n_x}"
-    )
+        n_x, n_y = board.corner_grid
+        notes.append(
+            "the first square of the print is light, as on a board of "
+            f"{n_y} x {n_x} inner corners; taken as the same board, with x along the {n_x}"
+        )
+    return replace(grid, notes=tuple(notes))
 
 
 def _rough_grids(image: GreyImage, grid: tuple[int, int]) -> Iterator[tuple[str, FloatArray]]:
@@ -288,19 +266,19 @@ def _rough_grids(image: GreyImage, grid: tuple[int, int]) -> Iterator[tuple[str,
         if found:
             # The centre of the top-left pixel is (0, 0) in both sizes.
             pixels = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
-            yield name, _right_handed(pixels.reshape(grid[1], grid[0], 2))
+            pixels = pixels.reshape(grid[1], grid[0], 2)
+            # Mirrored, if need be, so that z points into the board.
+            along_x = pixels[:, -1].mean(axis=0) - pixels[:, 0].mean(axis=0)
+            along_y = pixels[-1].mean(axis=0) - pixels[0].mean(axis=0)
+            mirrored = along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0.0
+            yield name, pixels[:, ::-1] if mirrored else pixels
 
 
-def _right_handed(pixels: FloatArray) -> FloatArray:
-    """Mirror the grid, if need be, so that z points into the board."""
-    along_x = pixels[:, -1].mean(axis=0) - pixels[:, 0].mean(axis=0)
-    along_y = pixels[-1].mean(axis=0) - pixels[0].mean(axis=0)
-    mirrored = along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0.0
-    return pixels[:, ::-1] if mirrored else pixels
+def _borne_out(image: GreyImage, rough: FloatArray) -> tuple[CornerGrid, bool]:
+    """Refine a grid and the ring of corners around it; shift it to where most are confirmed.
 
-
-def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
-    """Refine a grid and the ring of corners around it; shift it to where most are confirmed."""
+    Return it with whether its first square, in the picture's orientation, is light.
+    """
     rows, columns = rough.shape[:2]
     pixels = np.pad(rough, ((1, 1), (1, 1), (0, 0)))
     known = np.pad(np.ones((rows, columns), dtype=bool), 1)
@@ -321,8 +299,7 @@ def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
     shifts = sorted(np.ndindex(3, 3), key=lambda s: abs(s[0] - 1) + abs(s[1] - 1))
     dy, dx = max(shifts, key=lambda s: np.count_nonzero(seen[s[0] :, s[1] :][:rows, :columns]))
     window = np.s_[dy : dy + rows, dx : dx + columns]
-    grid = CornerGrid(pixels[window], seen[window])
-    return _Attempt(grid, first_is_light != bool((dy + dx) % 2))
+    return CornerGrid(pixels[window], seen[window]), first_is_light != bool((dy + dx) % 2)
 
 
 def _diagonal_is_light(image: GreyImage, pixels: FloatArray) -> bool:
@@ -335,15 +312,15 @@ def _diagonal_is_light(image: GreyImage, pixels: FloatArray) -> bool:
     return bool(tone[even].mean() > tone[~even].mean())
 
 
-def _in_board_order(found: _Attempt) -> tuple[CornerGrid, bool]:
+def _in_board_order(grid: CornerGrid, *, first_is_light: bool) -> tuple[CornerGrid, bool]:
     """Turn a grid so that the first square is dark; return whether it is light nevertheless."""
-    pixels, known = found.grid.pixels, found.grid.known
+    pixels, known = grid.pixels, grid.known
     rows, columns = known.shape
     # Number of squares by which the first one moves in each quarter turn.
     over = {0: 0, 2: rows + columns}
     if rows == columns:
         over |= {1: columns, 3: rows}
-    light = {turn: found.first_is_light != bool(n % 2) for turn, n in over.items()}
+    light = {turn: first_is_light != bool(n % 2) for turn, n in over.items()}
     dark = [turn for turn, is_light in light.items() if not is_light]
     best = min(dark or light, key=lambda turn: float(np.rot90(pixels, turn)[0, 0].sum()))
     return CornerGrid(np.rot90(pixels, best), np.rot90(known, best)), not dark
@@ -399,14 +376,9 @@ def _parts(image: GreyImage) -> Iterator[tuple[GreyImage, FloatArray]]:
 def _by_markers(markers: Markers, board: Board) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the corners of each marker's square, predicted by the marker's own homography.
 
-    Returns
-    -------
-    places : int array, shape (K, 4, 2)
-        Column and row of the square's corners in the grid; outside it at the board's edge.
-    pixels : array, shape (K, 4, 2)
-        Predicted places.
-    axes : array, shape (K, 2, 2)
-        Sides of the square along the board's x and y, as columns, in pixels.
+    They are column and row (K, 4, 2) of the corners in the grid, outside it at the board's edge,
+    the predicted pixels (K, 4, 2), and the sides (K, 2, 2) of the square along the board's x and y,
+    as columns, in pixels.
     """
     squares = board.marker_squares()
     near, far = board.margin_share, 1.0 - board.margin_share

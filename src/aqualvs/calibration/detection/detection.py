@@ -20,20 +20,19 @@ from aqualvs.calibration.detection.saddle_corners import GreyImage
 from aqualvs.calibration.detection.tag_corners import refine_tags
 from aqualvs.calibration.targets.targets import DICTIONARIES, Board, BoardKind, MarkerSet, View
 
+MIN_CORNERS = 6
+"""Least number of corners that determines a pose and reveals wrong corners."""
 # A single marker of a small dictionary is often a false detection in clutter.
 _ENOUGH = 4
 # The small dictionaries are the first markers of their large ones, ArUco's 36H12 aside.
 _LARGEST = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
 
 
-def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: int) -> str:
-    """Return one clause on the reason why there is no view of a board.
-
-    `n_corners` corners were found, of `min_corners` needed.
-    """
+def _why_no_board(image: GreyImage, board: Board, n_corners: int) -> str:
+    """Return one clause on the reason why there is no view of a board."""
     if n_corners > 0:
         return (
-            f"too few corners of the board ({n_corners}, at least {min_corners} are needed); show "
+            f"too few corners of the board ({n_corners}, at least {MIN_CORNERS} are needed); show "
             "more of it, or come nearer"
         )
     if board.kind is BoardKind.CHESSBOARD:
@@ -73,28 +72,23 @@ def _other_boards(board: Board) -> Iterator[tuple[Board, str]]:
     for step in range(-other_counts, other_counts + 1):
         n_x = board.squares[0] + step
         if step and n_x >= 3:
-            yield _wider(board, n_x), f"it looks as if squares_x were {n_x}"
+            # The dictionary limits the number of markers; fewer rows suffice for the comparison.
+            n_y = max(3, min(board.squares[1], 2 * board.n_markers // n_x))
+            yield replace(board, squares=(n_x, n_y)), f"it looks as if squares_x were {n_x}"
 
 
-def _wider(board: Board, n_x: int) -> Board:
-    # The dictionary limits the number of markers; fewer rows suffice for the comparison.
-    most = 2 * board.n_markers // n_x
-    return replace(board, squares=(n_x, max(3, min(board.squares[1], most))))
-
-
-def why_no_markers(
-    image: GreyImage, marker_set: MarkerSet, markers: Markers, n_corners: int, min_corners: int
+def _why_no_markers(
+    image: GreyImage, marker_set: MarkerSet, markers: Markers, n_corners: int
 ) -> str:
     """Return one clause on the reason why there is no view of a set of markers.
 
-    `markers` are all of its family that were read; `n_corners` corners were refined, of
-    `min_corners` needed.
+    `markers` are all of its family that were read; `n_corners` corners were refined.
     """
     ours = np.isin(markers.ids, marker_set.ids)
     if np.any(ours):
         return (
             f"{np.count_nonzero(ours)} of the markers, but too few clean corners ({n_corners}, at "
-            f"least {min_corners} are needed); come nearer, or keep stripes and glare off them"
+            f"least {MIN_CORNERS} are needed); come nearer, or keep stripes and glare off them"
         )
     if len(markers) > 0:
         return (
@@ -132,45 +126,36 @@ def _ids(markers: Markers) -> str:
     return f"read: {shown}{', ...' if len(markers) > 5 else ''}"
 
 
-MIN_CORNERS = 6
-"""Least number of corners that determines a pose and reveals wrong corners."""
-
-
-def detect_board(
-    image: GreyImage, board: Board, name: str, *, min_corners: int = MIN_CORNERS
-) -> View | str:
+def detect_board(image: GreyImage, board: Board, name: str) -> View | str:
     """Find the inner corners of a board in a grey picture, which messages call `name`.
 
     A ChArUco board may be seen in part, a chessboard only whole. Points of the view are in `board`,
-    ids count the inner corners row by row. With fewer than `min_corners` corners the reason is
+    ids count the inner corners row by row. With fewer than `MIN_CORNERS` corners the reason is
     returned instead, in a clause.
     """
     find = find_charuco if board.kind is BoardKind.CHARUCO else find_chessboard
     grid = find(image, board)
-    n = int(np.count_nonzero(grid.known))
-    if n < min_corners:
-        return why_no_board(image, board, n, min_corners)
+    if grid.n_known < MIN_CORNERS:
+        return _why_no_board(image, board, grid.n_known)
     ids = np.flatnonzero(grid.known).astype(np.int64)
     return View(name, ids, board.corner_points()[ids], grid.pixels.reshape(-1, 2)[ids], grid.notes)
 
 
-def detect_markers(
-    image: GreyImage, marker_set: MarkerSet, name: str, *, min_corners: int = MIN_CORNERS
-) -> View | str:
+def detect_markers(image: GreyImage, marker_set: MarkerSet, name: str) -> View | str:
     """Find the corners of the markers of a set in a grey picture, which messages call `name`.
 
     Other markers of the family are ignored. Points of the view are in the set's frame, ids are four
     times the index in the set plus the corner's place. Corners that could not be refined cleanly,
-    under a laser stripe for example, are missing. With fewer than `min_corners` corners the reason
+    under a laser stripe for example, are missing. With fewer than `MIN_CORNERS` corners the reason
     is returned instead, in a clause.
     """
     markers = read_markers(image, marker_set.family)
     index = {int(number): i for i, number in enumerate(marker_set.ids)}
-    ours = np.array([i for i, number in enumerate(markers.ids) if int(number) in index], np.int64)
+    ours = np.isin(markers.ids, marker_set.ids)
     tags = refine_tags(image, markers.ids[ours], markers.corners[ours], marker_set.family)
     places = np.array([index[int(number)] for number in markers.ids[ours]], np.int64)
     ids = (4 * places[:, None] + np.arange(4))[tags.valid]
-    if len(ids) < min_corners:
-        return why_no_markers(image, marker_set, markers, len(ids), min_corners)
+    if len(ids) < MIN_CORNERS:
+        return _why_no_markers(image, marker_set, markers, len(ids))
     order = np.argsort(ids, kind="stable")
     return View(name, ids[order], marker_set.points()[ids[order]], tags.pixels[tags.valid][order])

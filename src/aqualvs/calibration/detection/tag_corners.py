@@ -431,16 +431,8 @@ class TagFit:
 def refine_tags(image: GreyImage, ids: IntArray, quads: FloatArray, family: str) -> TagFit:
     """Refine the corners of markers by a fit to the picture.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width)
-        Grey picture.
-    ids : int array, shape (M,)
-        Numbers of the markers in their dictionary.
-    quads : array, shape (M, 4, 2)
-        Approximate places of their corners, in OpenCV's order, pixels.
-    family : str
-        Name of the dictionary.
+    `ids` (M,) are the numbers of the markers in their dictionary, `family`; `quads` (M, 4, 2) the
+    approximate places of their corners, in OpenCV's order, pixels.
     """
     image = np.ascontiguousarray(image)
     pixels, sigma = np.full((len(ids), 4, 2), np.nan), np.full((len(ids), 4), np.nan)
@@ -553,8 +545,7 @@ def _weigh(residuals: FloatArray, contrast: float, robust: bool) -> tuple[FloatA
     noise = max(1.4826 * float(np.nanmedian(size)), _FIT.min_noise)
     size = np.nan_to_num(size)
     # Pixels this many noise scales off, or this share of the contrast, show something else.
-    polluted_scales = 4.5
-    polluted_share = 0.08
+    polluted_scales, polluted_share = 4.5, 0.08
     limit = max(polluted_scales * noise, polluted_share * contrast)
     if robust:
         return np.square(1.0 / (1.0 + np.square(size / limit))), noise

@@ -7,6 +7,7 @@ uncertainty it had. `findings` says in plain words what the pictures determined.
 same solve finds its distance from the lens and its tilt.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -85,13 +86,19 @@ def findings(
     rotation = _rotation(problem, result, shared_tilt_sigma)
     lines = [place, rotation, *_dome(names, result, seen), *_unobservable(seen)]
     lens = observability(bundle, solution, uncertainty, result.rig.lens.parameter_names)
-    lines += _intrinsics(problem, result, lens)
-    lines += _entangled(result)
-    lines += _media(problem, result)
-    lines += _against_priors(problem, solution)
     what = "dome" if result.rig.flat_port is None else "port"
-    lines += _cross_validation(result.cross_validation, what)
-    lines += [f"left out, {label}: {why}" for label, why in result.left_out.items()]
+    lines += [
+        *_intrinsics(problem, result, lens),
+        *_entangled(result),
+        *(
+            f"{medium.name}: n = {medium.n:.5f} ± {medium.sigma:.5f}"
+            for i, medium in enumerate(result.media)
+            if i in bundle.free_media
+        ),
+        *_against_priors(problem, solution),
+        *_cross_validation(result.cross_validation, what),
+        *(f"left out, {label}: {why}" for label, why in result.left_out.items()),
+    ]
     return lines
 
 
@@ -119,14 +126,9 @@ def _port(result: DomeCalibration) -> str:
 
 def _rotation(problem: DomeProblem, result: DomeCalibration, shared_tilt_sigma: float) -> str:
     if not result.rotation_is_solved:
-        return (
-            "camera rotation: taken from the rig; boards at unknown poses do not determine it"
-            + (
-                ", and the lens position is given in axes turned by it"
-                if result.rig.flat_port is None
-                else ""
-            )
-        )
+        taken = "camera rotation: taken from the rig; boards at unknown poses do not determine it"
+        place = ", and the lens position is given in axes turned by it"
+        return taken + (place if result.rig.flat_port is None else "")
     sigma = np.rad2deg([result.uncertainty.sigmas[name] for name in ROTATION])
     sigmas = ", ".join(f"{axis} {value:.4f}" for axis, value in zip("xyz", sigma, strict=True))
     found = f"uncertain by {sigmas} deg about the dome's axes"
@@ -143,8 +145,12 @@ def _rotation(problem: DomeProblem, result: DomeCalibration, shared_tilt_sigma: 
 def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:
     # Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
     # something.
-    learnt_nothing = 0.9
-    learnt_something = 0.5
+    learnt_nothing, learnt_something = 0.9, 0.5
+
+    def size(name: str) -> str:
+        sigma = result.uncertainty.sigmas[name]
+        return f"{sigma:.4f}" if name.startswith("n_") else f"{1e3 * sigma:.3f} mm"
+
     lines = []
     nothing = seen.undetermined(names, learnt_nothing)
     some = [n for n in seen.undetermined(names, learnt_something) if n not in nothing]
@@ -155,17 +161,12 @@ def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) ->
         (rest, "determined by the pictures"),
     ):
         if group:
-            listed = ", ".join(f"{_WORDS[name]} (± {_size(name, result)})" for name in group)
+            listed = ", ".join(f"{_WORDS[name]} (± {size(name)})" for name in group)
             lines.append(f"{listed}: {what}")
     exact = [_WORDS[name] for name in names if name not in seen.shrinkage]
     if exact:
         lines.append(f"{', '.join(exact)}: taken as exact")
     return lines
-
-
-def _size(name: str, result: DomeCalibration) -> str:
-    sigma = result.uncertainty.sigmas[name]
-    return f"{sigma:.4f}" if name.startswith("n_") else f"{1e3 * sigma:.3f} mm"
 
 
 def _intrinsics(problem: DomeProblem, result: DomeCalibration, seen: Observability) -> list[str]:
@@ -206,24 +207,15 @@ def _entangled(result: DomeCalibration) -> list[str]:
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = uncertainty.covariance / np.outer(sigma, sigma)
     worst, pair, place = correlated, None, place_names(result.rig)
-    for i, name in enumerate(uncertainty.names):
-        for j, other in enumerate(uncertainty.names):
-            if name in place and other not in place and abs(correlation[i, j]) > worst:
-                worst, pair = abs(float(correlation[i, j])), (name, other)
+    for (i, name), (j, other) in itertools.product(enumerate(uncertainty.names), repeat=2):
+        if name in place and other not in place and abs(correlation[i, j]) > worst:
+            worst, pair = abs(float(correlation[i, j])), (name, other)
     if pair is None:
         return []
     one, other = (_WORDS.get(name, name) for name in pair)
     return [
         f"{one} and {other}: only their combination is known (correlation {worst:.3f}); an error "
         "of one compensates that of the other"
-    ]
-
-
-def _media(problem: DomeProblem, result: DomeCalibration) -> list[str]:
-    return [
-        f"{medium.name}: n = {medium.n:.5f} ± {medium.sigma:.5f}"
-        for i, medium in enumerate(result.media)
-        if i in problem.bundle.free_media
     ]
 
 
@@ -234,12 +226,10 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
     names = [name for name in bundle.free if name in bundle.priors.names]
     moved = rig_difference(bundle.start.rig, solution.state.rig, names)
     sigmas = bundle.priors.sigmas
-    off = {n: float(m) / sigmas[n] for n, m in zip(names, moved, strict=True)}
     return [
-        f"{_WORDS.get(name, name)}: moved by {abs(value):.1f} sigma from its given value; check "
-        "that value"
-        for name, value in off.items()
-        if abs(value) > far_from_prior
+        f"{_WORDS.get(name, name)}: moved by {off:.1f} sigma from its given value; check that value"
+        for name, off in zip(names, np.abs(moved / [sigmas[n] for n in names]), strict=True)
+        if off > far_from_prior
     ]
 
 
@@ -354,12 +344,12 @@ def _without_bad_views(
     n = len(problem.shots)
     noise = CORNER_SIGMA_PX * np.array(solution.block_scales[:n])
     typical = noise_px(solution)
-    bad = {}
-    for i in np.flatnonzero((noise > _BAD.times_typical * typical) & (noise > _BAD.noise_px)):
-        bad[int(i)] = (
-            f"its corners are {noise[i]:.2g} px off, those of other views {typical:.2g} px; wrong "
-            "pose, bent board or blurred picture?"
-        )
+    bad = {
+        i: f"its corners are {noise[i]:.2g} px off, those of other views {typical:.2g} px; wrong "
+        "pose, bent board or blurred picture?"
+        for i in range(n)
+        if noise[i] > max(_BAD.times_typical * typical, _BAD.noise_px)
+    }
     if not bad or len(bad) > _BAD.max_share * n:
         return problem, solution
     problem = problem.without(bad)
@@ -392,10 +382,10 @@ def _without_wrong_distances(
 
 
 def _wrong_distances(problem: DomeProblem, solution: Solution[BundleState]) -> list[int]:
-    off = distance_blocks(problem, solution)
     # A given distance with an error of this many sigmas is a mistake.
-    wrong_distance = 5.0
-    return [i for i, block in off.items() if block.lengths[0] > wrong_distance]
+    wrong = 5.0
+    off = distance_blocks(problem, solution)
+    return [i for i, block in off.items() if block.lengths[0] > wrong]
 
 
 def _result(
@@ -413,11 +403,16 @@ def _result(
         # The one medium that was solved for is the water that the rig will be used in.
         rig = rig.in_water(float(state.media[bundle.free_media[0]]))
         names, columns = (*names, "n_water"), [*columns, n_free]
+    media = []
+    for i, one in enumerate(sets):
+        column = bundle.medium_columns(i)
+        sigma = float(np.sqrt(covariance[column[0], column[0]])) if len(column) else 0.0
+        media.append(SolvedMedium(one.name, float(state.media[i]), sigma))
     labels = [shot.label for shot in problem.shots]
     return DomeCalibration(
         rig=rig,
         uncertainty=RigUncertainty(names, covariance[np.ix_(columns, columns)]),
-        media=_solved_media(problem, solution, sets, covariance),
+        media=tuple(media),
         views=view_fits(labels, bundle, solution, covariance),
         left_out=problem.left_out,
         noise_px=noise_px(solution),
@@ -425,17 +420,3 @@ def _result(
         cross_validation=None,
         findings=(),
     )
-
-
-def _solved_media(
-    problem: DomeProblem,
-    solution: Solution[BundleState],
-    sets: Sequence[BoardSet],
-    covariance: FloatArray,
-) -> tuple[SolvedMedium, ...]:
-    media = []
-    for i, one in enumerate(sets):
-        column = problem.bundle.medium_columns(i)
-        sigma = float(np.sqrt(covariance[column[0], column[0]])) if len(column) else 0.0
-        media.append(SolvedMedium(one.name, float(solution.state.media[i]), sigma))
-    return tuple(media)

@@ -7,9 +7,8 @@
 - Rail: errors that all given distances share, their zero and their scale against the board's.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import Enum, auto
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from aqualvs.calibration.dome.problem import (
     DomeProblem,
     PoseKind,
     place_names,
+    restarted,
 )
 from aqualvs.calibration.solver.bundle import (
     CORNER_SIGMA_PX,
@@ -69,14 +69,6 @@ MAX_NOISE_PX = 1.0
 """Corners noisier than this indicate an error other than noise."""
 
 
-@dataclass(frozen=True, slots=True)
-class FittedIndex:
-    """Index of a medium as fitted to the pictures, with its uncertainty."""
-
-    n: float
-    sigma: float
-
-
 def noise_px(solution: Solution[BundleState]) -> float:
     """Return the typical standard deviation of a corner's coordinate, in pixels."""
     return CORNER_SIGMA_PX * solution.scales[CORNERS]
@@ -91,17 +83,15 @@ def check_media(
     """
     doubts = []
     for medium, one in enumerate(sets):
-        if _suspicion(problem, solution, medium, one) is _Suspicion.NONE:
+        if _suspicion(problem, solution, medium, one) is None:
             continue
         # Errors of considered numbers and of a rail's zero bias the solution; they must not be
         # attributed to the medium.
         bare = problem.with_considered_free().without_distances(problem.measured_views)
         own = solve(bare.bundle, solution.state)
-        suspicion = _suspicion(bare, own, medium, one)
-        if suspicion is _Suspicion.OTHER:
-            doubts += _weighed_against_other(bare, own, medium, one)
-        elif suspicion is _Suspicion.NEARBY:
-            doubts += _weighed_against_best(bare, own, medium, one)
+        weighed = _suspicion(bare, own, medium, one)
+        if weighed is not None:
+            doubts += weighed(bare, own, medium, one)
     return doubts
 
 
@@ -113,9 +103,8 @@ def in_other_medium(problem: DomeProblem, medium: int) -> Solution[BundleState] 
     there = replace(start, media=media)
     poses = list(there.poses)
     for i, target in enumerate(problem.bundle.views):
-        if target.medium == medium and not target.fixed:
-            found = start_pose(there.camera(medium), target.view)
-            poses[i] = poses[i] if isinstance(found, str) else found.dome_from_target
+        if target.medium == medium:
+            poses[i] = restarted(there.camera(medium), target, poses[i])
     exact = replace(problem.bundle, media_sigma=np.zeros(len(media)))
     try:
         solution = solve(exact, replace(there, poses=tuple(poses)))
@@ -150,31 +139,24 @@ def _freed(bundle: Bundle, medium: int) -> Bundle:
     return replace(bundle, media_sigma=sigma)
 
 
-class _Suspicion(Enum):
-    NONE = auto()
-    NEARBY = auto()
-    """Another index fits the residuals."""
-    OTHER = auto()
-    """The residuals do not determine the index, or something else is wrong."""
-
-
 def _suspicion(
     problem: DomeProblem, solution: Solution[BundleState], medium: int, one: BoardSet
-) -> _Suspicion:
-    near = _nearby(_freed(problem.bundle, medium), solution, medium, one.n_medium)
+) -> Callable[[DomeProblem, Solution[BundleState], int, BoardSet], list[str]] | None:
+    """Return how to weigh another index if the residuals do not speak for the stated one."""
+    n, sigma = _nearby(_freed(problem.bundle, medium), solution, medium, one.n_medium)
     # With a larger uncertainty than this, an index near the stated one may be that of the other
     # medium.
     vague = 0.03
-    if near.sigma > vague or noise_px(solution) > MAX_NOISE_PX:
-        return _Suspicion.OTHER
-    far = abs(near.n - one.n_medium) > _MEDIUM.sure * near.sigma
-    return _Suspicion.NEARBY if far else _Suspicion.NONE
+    if sigma > vague or noise_px(solution) > MAX_NOISE_PX:
+        return _weighed_against_other
+    far = abs(n - one.n_medium) > _MEDIUM.sure * sigma
+    return _weighed_against_best if far else None
 
 
 def _nearby(
     bundle: Bundle, solution: Solution[BundleState], medium: int, stated: float
-) -> FittedIndex:
-    """Return the index that fits the residuals: one Newton step from the solution."""
+) -> tuple[float, float]:
+    """Return the index that fits the residuals, one Newton step from the solution; its sigma."""
     blocks = bundle.blocks(solution.state)
     n_data = sum(1 for b in solution.blocks if b.group != PRIORS)
     equations = normal_equations(
@@ -185,11 +167,10 @@ def _nearby(
     )
     column = int(bundle.medium_columns(medium)[0])
     if equations.information[column, column] == 0.0:
-        return FittedIndex(stated, float("inf"))
+        return stated, float("inf")
     covariance = inverse(equations.information)
     step = -float(covariance[column] @ equations.gradient)
-    sigma = float(np.sqrt(covariance[column, column]))
-    return FittedIndex(float(solution.state.media[medium]) + step, sigma)
+    return float(solution.state.media[medium]) + step, float(np.sqrt(covariance[column, column]))
 
 
 def _weighed_against_best(
@@ -248,8 +229,7 @@ def _gain(solution: Solution[BundleState], rival: Solution[BundleState]) -> floa
     return own - its
 
 
-@dataclass(frozen=True, slots=True)
-class SharedDistanceError:
+class _SharedError(NamedTuple):
     """An error that all given distances share, estimated from the pictures."""
 
     # In metres for an offset; a share for a scale. Given minus true.
@@ -265,22 +245,10 @@ class SharedDistanceError:
 def check_shared_errors(
     problem: DomeProblem, solution: Solution[BundleState], covariance: FloatArray
 ) -> list[str]:
-    """Compare the distances as a whole with the pictures.
+    """Compare the distances as a whole with the pictures; return warnings, in plain words.
 
-    Parameters
-    ----------
-    covariance : array, shape (P, P)
-        Of the solved numbers, with the uncertainty of considered ones propagated.
-
-    Returns
-    -------
-    list of str
-        Warnings, in plain words.
-
-    Raises
-    ------
-    CalibrationError
-        If the shared error of the distances is too large for a good rig.
+    `covariance` (P, P): of the solved numbers, with the uncertainty of considered ones propagated.
+    Raises `CalibrationError` if the shared error of the distances is too large for a good rig.
     """
     blocks = distance_blocks(problem, solution)
     if len(blocks) < 2:
@@ -345,13 +313,13 @@ def solved_by_shared_tilt(problem: DomeProblem, solution: Solution[BundleState])
 
 def _shared_error(
     covariance: FloatArray, blocks: Mapping[int, Block], shape: Mapping[int, float]
-) -> SharedDistanceError:
+) -> _SharedError:
     """Fit an error of a given shape over the distances, from derivatives at the solution."""
     slopes, own, gradient = _slopes(len(covariance), blocks, shape)
     left = own - float(slopes @ covariance @ slopes)
     if left <= 1e-9 * own:
-        return SharedDistanceError(0.0, float("inf"))
-    return SharedDistanceError(gradient / left, 1.0 / float(np.sqrt(left)))
+        return _SharedError(0.0, float("inf"))
+    return _SharedError(gradient / left, 1.0 / float(np.sqrt(left)))
 
 
 def _slopes(
@@ -373,8 +341,6 @@ def _slopes(
 
 # Differences of scale that are too large for errors of boards and rails.
 _FINE_SCALE, _EXACT_SCALE = 0.003, 0.02
-# Typical residual of distances, in sigmas, that agree with a solution.
-_FITTING_DISTANCE = 1.5
 _POSE_RULES = (
     "poses must be dome_from_board in millimetres, with OpenCV's board axes (x right, y down, z "
     "into the board) and dome axes x right, y forward, z up"
@@ -405,7 +371,11 @@ def check_initial_guess(problem: DomeProblem) -> None:
     if boards:
         given = np.array([problem.given_distance(i) for i in boards])
         found = np.array([plane_distance(views[i].dome_from_target) for i in boards])
-        _refuse_if(_sign_fault(given))
+        if not np.all(given > 0.0):
+            raise CalibrationError(
+                f"a board at the distance {1e3 * float(given.min()):g} mm; distances count forward "
+                "from the dome's centre and are positive"
+            )
         _refuse_if(scale_fault(length_ratio(given, found), coarse_scale))
 
 
@@ -435,19 +405,14 @@ def contradicted_distances(
     problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
 ) -> CalibrationError:
     """Return the message on given distances if the pictures contradict most of them."""
+    # Typical residual of distances, in sigmas, that agree with a solution.
+    fitting = 1.5
     for medium, one in enumerate(sets):
         rival = in_other_medium(problem, medium)
-        if rival is not None and _distances_fit(problem, rival):
-            return wrong_medium(one, other_medium(one.n_medium))
-    return _wrong_lengths(problem, solution)
-
-
-def _distances_fit(problem: DomeProblem, solution: Solution[BundleState]) -> bool:
-    off = [block.lengths[0] for block in distance_blocks(problem, solution).values()]
-    return bool(np.median(off) < _FITTING_DISTANCE)
-
-
-def _wrong_lengths(problem: DomeProblem, solution: Solution[BundleState]) -> CalibrationError:
+        if rival is not None:
+            off = [block.lengths[0] for block in distance_blocks(problem, rival).values()]
+            if np.median(off) < fitting:
+                return wrong_medium(one, other_medium(one.n_medium))
     boards = [i for i, shot in enumerate(problem.shots) if shot.kind is PoseKind.DISTANCE]
     free = problem.without_distances(boards)
     try:
@@ -488,12 +453,6 @@ def check_solution(
             "the solve does not come to rest; add views at other distances and tilts, and check "
             "the rig's dome"
         )
-    _check_lens(problem, solution, uncertainty)
-
-
-def _check_lens(
-    problem: DomeProblem, solution: Solution[BundleState], uncertainty: RigUncertainty
-) -> None:
     rig = solution.state.rig
     # Uncertainty of the lens position (metres) that makes an error of 0.4 % of range.
     max_lens_sigma = 2e-3
@@ -517,19 +476,16 @@ def _check_lens(
     values, vectors = np.linalg.eigh(uncertainty.of(place_names(rig)))
     sigma, axis = float(np.sqrt(values[-1])), vectors[:, -1] * np.sign(vectors[:, -1].sum())
     if sigma > max_lens_sigma:
+        remedy = "show more views, nearer, and with corners all over the picture"
+        if all(shot.kind is PoseKind.UNKNOWN for shot in problem.shots):
+            remedy = (
+                "give the boards' distances, show the board nearer and in more views, or take the "
+                "pictures in water, where refraction is five times stronger"
+            )
         raise CalibrationError(
             f"the pictures do not determine the lens position: {1e3 * sigma:.1f} mm uncertain "
-            f"along {np.round(axis, 1).tolist()}; {_remedy(problem)}"
+            f"along {np.round(axis, 1).tolist()}; {remedy}"
         )
-
-
-def _remedy(problem: DomeProblem) -> str:
-    if all(shot.kind is PoseKind.UNKNOWN for shot in problem.shots):
-        return (
-            "give the boards' distances, show the board nearer and in more views, or take the "
-            "pictures in water, where refraction is five times stronger"
-        )
-    return "show more views, nearer, and with corners all over the picture"
 
 
 def _exact_pose_fault(problem: DomeProblem, solution: Solution[BundleState]) -> str | None:
@@ -552,15 +508,6 @@ def _exact_pose_fault(problem: DomeProblem, solution: Solution[BundleState]) -> 
     one_scale = float(np.median(np.abs(ratios / ratio - 1.0))) < same_ratio
     fault = scale_fault(ratio, _EXACT_SCALE) if one_scale else None
     return fault or f"the given poses contradict the pictures; {_POSE_RULES}"
-
-
-def _sign_fault(given: FloatArray) -> str | None:
-    if np.all(given > 0.0):
-        return None
-    return (
-        f"a board at the distance {1e3 * float(given.min()):g} mm; distances count forward from "
-        "the dome's centre and are positive"
-    )
 
 
 def _refuse_if(fault: str | None) -> None:

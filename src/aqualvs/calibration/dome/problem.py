@@ -268,9 +268,8 @@ def initial_rigs(rig: Rig) -> Iterator[Rig]:
     A stated lens position far to the wrong side may leave no pose of a board to start from.
     """
     yield rig
-    if rig.flat_port is not None:
-        return
-    yield replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
+    if rig.flat_port is None:
+        yield replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
 
 
 def dome_problem(
@@ -278,17 +277,8 @@ def dome_problem(
 ) -> DomeProblem:
     """Return the problem with starting poses.
 
-    Parameters
-    ----------
-    rig : Rig
-        Initial guess; its lens lies inside the dome, or behind the flat port.
-    known : RigUncertainty
-        Of the rig beforehand: intrinsics from the camera's calibration.
-
-    Raises
-    ------
-    CalibrationError
-        If no view has a starting pose.
+    The lens of `rig`, the initial guess, lies inside the dome, or behind the flat port; `known` is
+    its uncertainty beforehand. Raises `CalibrationError` if no view has a starting pose.
     """
     shots, poses, left_out = _started(rig, sets)
     boards = [i for i, shot in enumerate(shots) if shot.kind is PoseKind.DISTANCE]
@@ -318,10 +308,13 @@ def dome_problem(
 
 def _started(rig: Rig, sets: Sequence[BoardSet]) -> tuple[list[Shot], list[SE3], dict[str, str]]:
     cameras = [rig.in_water(one.n_medium).camera() for one in sets]
-    shots, poses, left_out = [], [], {}
-    misfits = []
+    shots, poses, misfits, left_out = [], [], [], {}
     for shot in shots_of(sets):
-        start = _start(cameras[shot.i_set], shot)
+        start: StartPose | str
+        if shot.given is not None and shot.given.dome_from_board is not None:
+            start = StartPose(shot.given.dome_from_board, 0.0)
+        else:
+            start = start_pose(cameras[shot.i_set], shot.view)
         if isinstance(start, str):
             left_out[shot.label] = start
             continue
@@ -352,12 +345,6 @@ def _why_none(rig: Rig, sets: Sequence[BoardSet]) -> str | None:
     return implausible_distance(np.array([*found.values()]), [*found]) if found else None
 
 
-def _start(camera: Camera, shot: Shot) -> StartPose | str:
-    if shot.given is not None and shot.given.dome_from_board is not None:
-        return StartPose(shot.given.dome_from_board, 0.0)
-    return start_pose(camera, shot.view)
-
-
 def _known(shot: Shot, square: FloatArray, options: DomeOptions) -> tuple[PoseTerm, ...]:
     if shot.given is None or shot.given.distance is None or shot.kind is PoseKind.EXACT:
         return ()
@@ -385,37 +372,25 @@ def _priors(
     return combined(dome, moving), considered
 
 
-# Boards are not set up better than this: 0.9 mm a metre.
-_FINEST = float(np.deg2rad(0.05))
-_STEP = 0.5
-
-
 def with_board_tilt_as_found(
     problem: DomeProblem, solution: Solution[BundleState], sigma: float
 ) -> tuple[DomeProblem, Solution[BundleState]]:
     """Solve with a finer scale of the boards' tilt as long as they agree that closely.
 
-    Parameters
-    ----------
-    problem, solution
-        Solved with `sigma`.
-    sigma : float
-        Scale of the tilt, in radians.
-
-    Returns
-    -------
-    problem, solution
-        Unchanged if boards do not agree better, or nothing is known of their poses.
+    `sigma` is the scale, in radians, that the problem was solved with. Both are returned unchanged
+    if boards do not agree better, or nothing is known of their poses.
     """
+    # Boards are not set up better than this: 0.9 mm a metre.
+    finest, step = float(np.deg2rad(0.05)), 0.5
     # A finer scale must raise the log likelihood by this much: odds of 20 to 1.
     evidence = 3.0
-    while sigma * _STEP >= _FINEST * (1.0 - 1e-9):
-        finer = problem.with_board_tilt_prior(sigma * _STEP)
+    while sigma * step >= finest * (1.0 - 1e-9):
+        finer = problem.with_board_tilt_prior(sigma * step)
         trial = solve(finer.bundle, solution.state)
-        gain = _misfit(solution, sigma) - _misfit(trial, sigma * _STEP)
+        gain = _misfit(solution, sigma) - _misfit(trial, sigma * step)
         if not (trial.converged and gain > evidence):
             break
-        problem, solution, sigma = finer, trial, sigma * _STEP
+        problem, solution, sigma = finer, trial, sigma * step
     return problem, solution
 
 
@@ -484,7 +459,10 @@ def _bare_state(
     """Solve a bare lens with free pose from the same pictures."""
     bundle = problem.bundle
     rig = replace(solution.state.rig, housing=None)
-    views = [_bare_view(rig.camera(), bundle.views[i], solution.state, i) for i in rest]
+    views = []
+    for i in rest:
+        pose = restarted(rig.camera(), bundle.views[i], solution.state.poses[i])
+        views.append(replace(bundle.views[i], dome_from_target=pose))
     intrinsics = tuple(name for name in bundle.free if name in rig.lens.parameter_names)
     # With unknown poses the place is arbitrary.
     free = (LENS + ROTATION if problem.rotation_is_solved else ()) + intrinsics
@@ -496,12 +474,12 @@ def _bare_state(
     return solve(bare, replace(start, rig=rig)).state
 
 
-def _bare_view(camera: Camera, target: TargetView, state: BundleState, i: int) -> TargetView:
+def restarted(camera: Camera, target: TargetView, pose: SE3) -> SE3:
+    """Return a target's pose found with another camera; `pose` if it is exact or none is found."""
     if target.fixed:
-        return target
+        return pose
     found = start_pose(camera, target.view)
-    pose = state.poses[i] if isinstance(found, str) else found.dome_from_target
-    return replace(target, dome_from_target=pose)
+    return pose if isinstance(found, str) else found.dome_from_target
 
 
 def predicted(state: BundleState, media: Sequence[int], views: Sequence[View]) -> list[FloatArray]:

@@ -9,24 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.lasers.checks import (
-    LaserCalibration,
-    LaserFigures,
-    SolvedLasers,
-    ViewFigures,
-    check_count,
-    check_distances,
-    check_medium,
-    check_poses,
-    check_size,
-    far_apart,
-    laser_figures,
-    like,
-    loose_text,
-    match_to_rig,
-    named,
-    view_figures,
-)
+from aqualvs.calibration.lasers import checks
 from aqualvs.calibration.lasers.covariance import CameraCovariance, joint_uncertainty
 from aqualvs.calibration.lasers.laser_assignment import (
     BENT_TOLERANCE_PX,
@@ -76,20 +59,11 @@ def calibrate_lasers(
     *,
     options: LaserOptions | None = None,
     uncertainty: RigUncertainty | None = None,
-) -> LaserCalibration:
+) -> checks.LaserCalibration:
     """Solve the lasers of a rig from pictures of a target that they shine on.
 
-    Parameters
-    ----------
-    rig : Rig
-        Camera, dome and media; its lasers, if any, give names, order and windows.
-    views : sequence of LaserView
-        Corners and stripes of every picture.
-    surfaces : TargetSurfaces
-        Of the target: `box_surfaces` or `board_surface`.
-    options : LaserOptions, optional
-    uncertainty : RigUncertainty, optional
-        Of the camera's numbers; without it they are exact.
+    Lasers of `rig`, if any, give names, order and windows. `surfaces` are those of the target, by
+    `box_surfaces` or `board_surface`. Without an `uncertainty` the camera's numbers are exact.
 
     Raises
     ------
@@ -107,19 +81,19 @@ def calibrate_lasers(
             "refinement is asked for, but the rig says of none of its camera's numbers how well "
             "it is known; calibrate the camera and dome first, or leave refinement out"
         )
-    check_size(views)
+    checks.check_size(views)
     seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
     placed, left_out = place_views(seen_rig.camera(), views, surfaces)
-    check_medium(placed, rig, seen_rig)
-    check_poses(placed)
-    check_distances(placed, rig)
+    checks.check_medium(placed, rig, seen_rig)
+    checks.check_poses(placed)
+    checks.check_distances(placed, rig)
     lasers, laser_of, warnings = _sorted_stripes(rig, placed, surfaces, options)
     start = InitialGuess(
         seen_rig, surfaces, tuple(placed), camera_covariance if options.refine else None
     )
     solved, words = solve_lasers(start, lasers, laser_of, options.loose)
     result = _result_rig(rig, solved, lasers, start.camera_covariance)
-    joint = joint_uncertainty(
+    joint, planes = joint_uncertainty(
         solved.solution,
         solved.problem,
         camera_covariance,
@@ -128,11 +102,11 @@ def calibrate_lasers(
         stripe_bias_px=options.stripe_bias_px,
     )
     each = zip(result.lasers, paper_planes(solved), words, strict=True)
-    figures = [laser_figures(solved, joint, i, *one) for i, one in enumerate(each)]
-    pictures = [view_figures(solved, i, view) for i, view in enumerate(solved.views)]
-    return LaserCalibration(
+    figures = [checks.laser_figures(solved, planes[i], i, *one) for i, one in enumerate(each)]
+    pictures = [checks.view_figures(solved, i, view) for i, view in enumerate(solved.views)]
+    return checks.LaserCalibration(
         rig=result,
-        uncertainty=joint.uncertainty,
+        uncertainty=joint,
         lasers=tuple(figures),
         views=tuple(pictures),
         left_out=left_out,
@@ -147,18 +121,18 @@ def _sorted_stripes(
     """Return the lasers with rough planes, the index of each point's laser, and warnings."""
     split, warnings = _split(rig, views, surfaces, options)
     if len(rig.lasers) == len(split.planes):
-        order = [i for i in match_to_rig(rig, split.planes) if i is not None]
+        order = [i for i in checks.match_to_rig(rig, split.planes) if i is not None]
         lasers = [
-            replace(laser, plane=like(split.planes[i], laser.plane))
+            replace(laser, plane=checks.like(split.planes[i], laser.plane))
             for laser, i in zip(rig.lasers, order, strict=True)
         ]
         warnings += [
             f"laser '{old.name}' is far from where the rig had it; check that it is the same one"
             for old, new in zip(rig.lasers, lasers, strict=True)
-            if far_apart(old, new.plane)
+            if checks.far_apart(old, new.plane)
         ]
     else:
-        order, lasers = named(split.planes)
+        order, lasers = checks.named(split.planes)
     place = np.full(len(order) + 1, -1)
     place[order] = np.arange(len(order))
     return lasers, place[split.laser], warnings
@@ -178,16 +152,16 @@ def _split(
     if len(surfaces.planes) == 1 and (split.torn or len(split.planes) < (expected or 1)):
         lenient = split_within(BENT_TOLERANCE_PX)
         try:
-            return lenient, check_count(lenient, expected, rig, views, surfaces)
+            return lenient, checks.check_count(lenient, expected, rig, views, surfaces)
         except CalibrationError:
             # The message about the stricter split is the plainer one.
             pass
-    return split, check_count(split, expected, rig, views, surfaces)
+    return split, checks.check_count(split, expected, rig, views, surfaces)
 
 
 def _result_rig(
     rig: Rig,
-    solved: SolvedLasers,
+    solved: checks.SolvedLasers,
     lasers: Sequence[Laser],
     camera_covariance: CameraCovariance | None,
 ) -> Rig:
@@ -200,7 +174,9 @@ def _result_rig(
 
 
 def _warnings(
-    solved: SolvedLasers, lasers: Sequence[LaserFigures], views: Sequence[ViewFigures]
+    solved: checks.SolvedLasers,
+    lasers: Sequence[checks.LaserFigures],
+    views: Sequence[checks.ViewFigures],
 ) -> list[str]:
     # Larger residuals of corners, in pixels, indicate a wrong rig, medium or target.
     bad_corners_px = 0.5
@@ -227,7 +203,7 @@ def _warnings(
         if figures.rms_px > bad_stripes_px
     ]
     if solved.problem.board_pose_prior is not None:
-        words.append(loose_text(solved))
+        words.append(checks.loose_text(solved))
     if not solved.solution.converged:
         words.append("the solve did not settle; look at the residuals before using this rig")
     return words

@@ -10,7 +10,7 @@ come from the pictures themselves. The number of points does not count.
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -46,28 +46,20 @@ class StripeLine:
 
 
 def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list[StripeLine]:
-    """Find the straight stripes among points of one surface.
+    """Find the straight stripes among the points `members` (M,) of one surface.
 
-    Parameters
-    ----------
-    pooled : PooledStripes
-        Points of all patches.
-    members : int array, shape (M,)
-        Indices of the points on the surface.
-    patch : int
-        Index of the surface.
-
-    Returns
-    -------
-    list of StripeLine
-        Longest first; no point belongs to two.
+    Longest first; no point belongs to two.
     """
     placed, normal = pooled.placed, pooled.patch_planes[patch].normal
     points, across = placed.points_in_dome[members], placed.by_across[members]
     along = placed.by_along[members]
     some = slice(None, None, -(-len(members) // _LINES.n_sampled) or 1)
     i, j = _pairs(pooled.chain[members], patch)
-    guessed, offsets = _guesses(points, normal, i, j)
+    # Lines m·X = c through the pairs, m in the surface; NaN for equal points.
+    guessed = np.cross(normal, points[j] - points[i])
+    length = np.linalg.norm(guessed, axis=1)
+    guessed /= np.where(length > 1e-6, length, np.nan)[:, None]
+    offsets = np.einsum("ni,ni->n", guessed, points[i])
     # Most pairs are of two stripes; their directions are not that of the line through both points.
     good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
     guessed, offsets = guessed[good], offsets[good]
@@ -109,16 +101,6 @@ def _pairs(chain: IntArray, seed: int) -> tuple[IntArray, IntArray]:
     last = np.searchsorted(chain[order], chain[i[half]], "right")
     j[half] = order[rng.integers(first, last)]
     return i, j
-
-
-def _guesses(
-    points: FloatArray, normal: FloatArray, i: IntArray, j: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return lines m·X = c through pairs of points, m in the surface; NaN for equal points."""
-    m = np.cross(normal, points[j] - points[i])
-    length = np.linalg.norm(m, axis=1)
-    m /= np.where(length > 1e-6, length, np.nan)[:, None]
-    return m, np.einsum("ni,ni->n", m, points[i])
 
 
 def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:
@@ -200,6 +182,7 @@ class PlaneCandidate:
 
     plane: Plane  # In `dome`.
     lines: IntArray  # Shape (K,): indices of the lines in it.
+    members: IntArray  # Shape (M,): indices of their points.
     # Natural logarithm of the number of accidental planes as good as this one that are expected in
     # these pictures.
     log_false_alarms: float
@@ -209,8 +192,11 @@ class PlaneCandidate:
 
 @dataclass(frozen=True, slots=True)
 class LineTable:
-    """Ends and middles of L lines, from which planes are guessed and on which they are tested."""
+    """L lines with their ends and middles: planes are guessed from them and tested on them."""
 
+    pooled: PooledStripes  # Points of all views.
+    lines: Sequence[StripeLine]  # Straight stripes of all surfaces.
+    tolerance_px: float  # Greatest distance of a stripe from its plane.
     patch: IntArray  # Shape (L,): index of the line's surface of a view.
     length: FloatArray  # Shape (L,): in metres.
     points: FloatArray  # Shape (L, 3, 3): ends and middle, in `dome`.
@@ -218,7 +204,9 @@ class LineTable:
     by_across: FloatArray
 
     @classmethod
-    def of(cls, pooled: PooledStripes, lines: Sequence[StripeLine]) -> "LineTable":
+    def of(
+        cls, pooled: PooledStripes, lines: Sequence[StripeLine], tolerance_px: float
+    ) -> "LineTable":
         """Return the table of some lines."""
         points, by_across = np.zeros((len(lines), 3, 3)), np.zeros((len(lines), 3, 3))
         for i, line in enumerate(lines):
@@ -230,12 +218,9 @@ class LineTable:
             points[i] = middle + ends[:, None] * direction
             nearest = np.argmin(np.abs(way[:, None] - ends), axis=0)
             by_across[i] = pooled.placed.by_across[line.members][nearest]
-        return cls(
-            np.array([line.patch for line in lines], np.int64),
-            np.linalg.norm(points[:, 2] - points[:, 0], axis=1),
-            points,
-            by_across,
-        )
+        patch = np.array([line.patch for line in lines], np.int64)
+        length = np.linalg.norm(points[:, 2] - points[:, 0], axis=1)
+        return cls(pooled, lines, tolerance_px, patch, length, points, by_across)
 
     def worst_px(self, normals: FloatArray, offsets: FloatArray) -> FloatArray:
         """Return the distance of lines from planes at their worst end, in pixels, shape (H, L)."""
@@ -244,6 +229,14 @@ class LineTable:
         with np.errstate(divide="ignore", invalid="ignore"):
             worst: FloatArray = np.max(distance / gain, axis=2)
         return np.nan_to_num(worst, nan=np.inf)
+
+    def worst_of(self, plane: Plane) -> FloatArray:
+        """Return the distance of lines from a plane at their worst end, in pixels, shape (1, L)."""
+        return self.worst_px(plane.normal[None], np.array([plane.offset]))
+
+    def members(self, lines: IntArray) -> IntArray:
+        """Return the indices of the points of some lines."""
+        return np.concatenate([self.lines[int(i)].members for i in lines])
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,12 +251,16 @@ class _Hypotheses:
     kept_share: float
 
     @classmethod
-    def of(cls, pooled: PooledStripes, table: LineTable, tolerance_px: float) -> "_Hypotheses":
-        pairs = _pairs_of_lines(pooled, table)
-        n_expected = len(pairs) * _meeting_rate(table, pairs, tolerance_px)
-        normals, offsets = _planes_of_pairs(table, pairs)
-        meet = _pairs_meet(table, pairs, normals, offsets, tolerance_px)
-        kept = np.flatnonzero(meet)
+    def of(cls, table: LineTable) -> "_Hypotheses":
+        # Pairs of lines that lie on different surfaces.
+        different = ~_same_surfaces(table.pooled.patch_planes)
+        i, j = np.triu_indices(len(table.patch), 1)
+        apart = different[table.patch[i], table.patch[j]]
+        pairs = np.stack([i[apart], j[apart]], axis=-1)
+        n_expected = len(pairs) * _meeting_rate(table, pairs)
+        points, by_across = table.points[pairs], table.by_across[pairs]
+        normals, offsets = _planes_of_pairs(points)
+        kept = np.flatnonzero(_meet(points, by_across, normals, offsets, table.tolerance_px))
         # Number of pairs beyond which they are sampled; number of planes tried at a time.
         max_planes, at_once = 6000, 500
         share = min(1.0, max_planes / max(len(kept), 1))
@@ -287,92 +284,69 @@ class _Accidents:
     n_planes: float
 
 
-def find_candidates(
-    pooled: PooledStripes, lines: Sequence[StripeLine], tolerance_px: float
-) -> list[PlaneCandidate]:
+def find_candidates(table: LineTable) -> list[PlaneCandidate]:
     """Find planes of straight stripes, the best first; no line is used twice.
 
-    Parameters
-    ----------
-    pooled : PooledStripes
-        Points of all views.
-    lines : sequence of StripeLine
-        Straight stripes of all surfaces.
-    tolerance_px : float
-        Greatest distance of a stripe from its plane.
-
-    Returns
-    -------
-    list of PlaneCandidate
-        Planes with an expected number of accidents below one.
+    The expected number of accidents of each plane is below one.
     """
-    table = LineTable.of(pooled, lines)
-    planes = _Hypotheses.of(pooled, table, tolerance_px)
+    planes = _Hypotheses.of(table)
     found: list[PlaneCandidate] = []
     if not len(planes.pairs):
         return found
     accidental = np.zeros(len(planes.pairs), np.bool_)
     for _ in range(_ACCIDENTS.n_rounds):
-        accidents = _accidents(table, planes, accidental, tolerance_px)
-        found = _collected(pooled, lines, table, planes, accidents, tolerance_px)
-        accidental = _accidental(len(lines), planes.pairs, found)
+        found = _collected(table, planes, _accidents(table, planes, accidental))
+        # Accidental are the pairs that are not of two lines of one found plane.
+        owner = np.full(len(table.patch), -1)
+        for i, candidate in enumerate(found):
+            owner[candidate.lines] = i
+        of_pair = owner[planes.pairs]
+        accidental = (of_pair[:, 0] != of_pair[:, 1]) | (of_pair[:, 0] < 0)
     return found
 
 
-def ordered_candidates(
-    pooled: PooledStripes, lines: Sequence[StripeLine], n_lasers: int, tolerance_px: float
-) -> list[PlaneCandidate]:
+def ordered_candidates(table: LineTable, n_lasers: int) -> list[PlaneCandidate]:
     """Find the planes of lasers whose stripes lie side by side, in one order on every surface.
 
     Near-parallel stripes meet accidental planes so often that three surfaces are no evidence for a
     single plane. But if each of them shows as many stripes as lasers shine, their order tells which
     belong together.
 
-    Parameters
-    ----------
-    pooled, lines, tolerance_px
-        As in `find_candidates`.
-    n_lasers : int
-        Number of lasers that shine.
-
-    Returns
-    -------
-    list of PlaneCandidate
-        As many as lasers; none if there are fewer than three such surfaces, a stripe is farther
-        from its plane than the tolerance, or stripes shifted by one place fit nearly as well.
+    Returns as many planes as lasers shine; none if there are fewer than three such surfaces, a
+    stripe is farther from its plane than the tolerance, or stripes shifted by one place fit nearly
+    as well.
     """
-    table = LineTable.of(pooled, lines)
     of_patches = [
         mine
         for patch in np.unique(table.patch)
-        if len(mine := _longest(lines, np.flatnonzero(table.patch == patch), n_lasers))
+        if len(mine := _longest(table, np.flatnonzero(table.patch == patch), n_lasers))
     ]
     # Enough surfaces to test the order; more are not needed.
     fewest, most = 3, 4
-    same = _same_surfaces([pooled.patch_planes[table.patch[mine[0]]] for mine in of_patches])
+    planes = table.pooled.patch_planes
+    same = _same_surfaces([planes[table.patch[mine[0]]] for mine in of_patches])
     apart = [
         mine for mine, others in zip(of_patches, np.tril(same, -1), strict=True) if not others.any()
     ]
     if n_lasers < 2 or len(apart) < fewest:
         return []
     order = _side_by_side(table, apart[:most])
-    found = [_plane_of_lines(pooled, lines, table, mine) for mine in order.T]
-    if max(one.residual_px for one in found) > tolerance_px:
+    found = [_plane_of_lines(table, mine) for mine in order.T]
+    if max(one.residual_px for one in found) > table.tolerance_px:
         return []
     error = _rms_px(found)
     # The assignments by shifted orders that must be worse, and by which factor.
     clearly_worse = 3.0
     for shifts in filter(any, itertools.product((-1, 0, 1), repeat=len(order) - 1)):
-        shifted = _shifted(order, (0, *shifts))
-        rivals = [_plane_of_lines(pooled, lines, table, mine) for mine in shifted.T]
+        rivals = [_plane_of_lines(table, mine) for mine in _shifted(order, (0, *shifts)).T]
         if rivals and _rms_px(rivals) < clearly_worse * error:
             return []
     return found
 
 
-def _longest(lines: Sequence[StripeLine], mine: IntArray, n: int) -> IntArray:
+def _longest(table: LineTable, mine: IntArray, n: int) -> IntArray:
     """Return the n longest of some lines if the others are much shorter; else none."""
-    size = np.array([len(lines[int(i)].members) for i in mine])
+    size = np.array([len(table.lines[int(i)].members) for i in mine])
     longest = np.argsort(-size, kind="stable")
     # Largest length of another line, as a share of theirs: a reflection, or part of an edge.
     much_shorter = 0.5
@@ -400,42 +374,28 @@ def _shifted(order: IntArray, shifts: Sequence[int]) -> IntArray:
     return np.stack([row[start : start + n] for row, start in zip(order, starts, strict=True)])
 
 
-def _plane_of_lines(
-    pooled: PooledStripes, lines: Sequence[StripeLine], table: LineTable, mine: IntArray
-) -> PlaneCandidate:
+def _plane_of_lines(table: LineTable, mine: IntArray) -> PlaneCandidate:
     """Return the plane that some lines lie in, as certain."""
-    normals, offsets = _planes_of_pairs(table, mine[None, :2])
+    normals, offsets = _planes_of_pairs(table.points[mine[None, :2]])
     plane = Plane(normals[0], float(offsets[0]))
-    members = np.concatenate([lines[int(i)].members for i in mine])
+    members = table.members(mine)
     for _ in range(_N_PLANE_FITS):
-        plane = fitted_plane(pooled.placed, members, plane)
-    worst = table.worst_px(plane.normal[None], np.array([plane.offset]))[0, mine]
-    return PlaneCandidate(plane, mine, -np.inf, float(np.sqrt(np.mean(worst**2))))
+        plane = fitted_plane(table.pooled.placed, members, plane)
+    worst = table.worst_of(plane)[0, mine]
+    return PlaneCandidate(plane, mine, members, -np.inf, float(np.sqrt(np.mean(worst**2))))
 
 
 def _rms_px(candidates: Sequence[PlaneCandidate]) -> float:
     return float(np.sqrt(np.mean([one.residual_px**2 for one in candidates])))
 
 
-def _accidental(n_lines: int, pairs: IntArray, found: Sequence[PlaneCandidate]) -> BoolArray:
-    """Return the mask of pairs (H,) that are not of two lines of one found plane."""
-    owner = np.full(n_lines, -1)
-    for i, candidate in enumerate(found):
-        owner[candidate.lines] = i
-    of_pair = owner[pairs]
-    accidental: BoolArray = (of_pair[:, 0] != of_pair[:, 1]) | (of_pair[:, 0] < 0)
-    return accidental
-
-
-def _accidents(
-    table: LineTable, planes: _Hypotheses, accidental: BoolArray, tolerance_px: float
-) -> _Accidents:
+def _accidents(table: LineTable, planes: _Hypotheses, accidental: BoolArray) -> _Accidents:
     """Count how often planes of accidental pairs (H,) meet lines."""
     n = np.count_nonzero(accidental)
-    met = np.count_nonzero(planes.worst[accidental] <= tolerance_px, axis=0)
+    met = np.count_nonzero(planes.worst[accidental] <= table.tolerance_px, axis=0)
     # A pair's own lines are met by construction.
     met = met - np.bincount(planes.pairs[accidental].ravel(), minlength=len(table.patch))
-    prior = min(1.0, 2.0 * tolerance_px / _ACCIDENTS.spread_px)
+    prior = min(1.0, 2.0 * table.tolerance_px / _ACCIDENTS.spread_px)
     own_rate = (np.maximum(met, 0) + _ACCIDENTS.prior_weight * prior) / (
         n + _ACCIDENTS.prior_weight
     )
@@ -448,18 +408,13 @@ def _accidents(
 
 
 def _collected(
-    pooled: PooledStripes,
-    lines: Sequence[StripeLine],
-    table: LineTable,
-    planes: _Hypotheses,
-    accidents: _Accidents,
-    tolerance_px: float,
+    table: LineTable, planes: _Hypotheses, accidents: _Accidents
 ) -> list[PlaneCandidate]:
     """Extract the best plane and its lines, as long as one is better than accidents."""
     found: list[PlaneCandidate] = []
-    free = np.ones(len(lines), np.bool_)
+    free = np.ones(len(table.patch), np.bool_)
     alive = np.ones(len(planes.pairs), np.bool_)
-    nearness = _nearness(planes.worst, tolerance_px)
+    nearness = _nearness(planes.worst, table.tolerance_px)
     for _ in range(_ACCIDENTS.max_trials):
         alive &= np.all(free[planes.pairs], axis=1)
         alarms = _log_false_alarms(table, np.where(free, nearness, np.inf), accidents)
@@ -469,7 +424,7 @@ def _collected(
             break
         alive[best] = False
         start = Plane(planes.normals[best], float(planes.offsets[best]))
-        candidate = _fitted_candidate(pooled, lines, table, free, start, accidents, tolerance_px)
+        candidate = _fitted_candidate(table, free, start, accidents)
         if candidate is None:
             continue
         if candidate.log_false_alarms > 0.0:
@@ -509,40 +464,30 @@ def _log_false_alarms(table: LineTable, nearness: FloatArray, accidents: _Accide
 
 
 def _fitted_candidate(
-    pooled: PooledStripes,
-    lines: Sequence[StripeLine],
-    table: LineTable,
-    free: BoolArray,
-    plane: Plane,
-    accidents: _Accidents,
-    tolerance_px: float,
+    table: LineTable, free: BoolArray, plane: Plane, accidents: _Accidents
 ) -> PlaneCandidate | None:
     """Fit a plane to the points of the free lines near it, and evaluate its evidence anew."""
     for fits_left in range(_N_PLANE_FITS, -1, -1):
-        worst = table.worst_px(plane.normal[None], np.array([plane.offset]))
-        mine = np.flatnonzero(free & (worst[0] <= tolerance_px))
-        if not _on_two_surfaces(pooled, table.patch[mine]):
+        worst = table.worst_of(plane)
+        mine = np.flatnonzero(free & (worst[0] <= table.tolerance_px))
+        patches = np.unique(table.patch[mine])
+        if _same_surfaces([table.pooled.patch_planes[i] for i in patches]).all():
             return None
+        members = table.members(mine)
         if fits_left:
-            members = np.concatenate([lines[int(i)].members for i in mine])
-            plane = fitted_plane(pooled.placed, members, plane)
-    nearness = np.where(free, _nearness(worst, tolerance_px), np.inf)
+            plane = fitted_plane(table.pooled.placed, members, plane)
+    nearness = np.where(free, _nearness(worst, table.tolerance_px), np.inf)
     alarms = _log_false_alarms(table, nearness, accidents)
     residual = float(np.sqrt(np.mean(worst[0, mine] ** 2)))
-    return PlaneCandidate(plane, mine, float(alarms[0]), residual)
+    return PlaneCandidate(plane, mine, members, float(alarms[0]), residual)
 
 
-def _pairs_of_lines(pooled: PooledStripes, table: LineTable) -> IntArray:
-    """Return pairs of lines (P, 2) that lie on different surfaces."""
-    different = ~_same_surfaces(pooled.patch_planes)
-    i, j = np.triu_indices(len(table.patch), 1)
-    keep = different[table.patch[i], table.patch[j]]
-    return np.stack([i[keep], j[keep]], axis=-1)
+def _planes_of_pairs(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return planes (P, 3), (P,) through two lines each, by the ends in their points (P, 2, 3, 3).
 
-
-def _planes_of_pairs(table: LineTable, pairs: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return planes (P, 3), (P,) through two lines each, by their ends."""
-    ends = table.points[pairs][:, :, [0, 2]].reshape(len(pairs), 4, 3)
+    `points`: as in `LineTable`.
+    """
+    ends = points[:, :, [0, 2]].reshape(len(points), 4, 3)
     middle = ends.mean(axis=1)
     offsets = ends - middle[:, None]
     normals = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets)[1][:, :, 0]
@@ -550,19 +495,21 @@ def _planes_of_pairs(table: LineTable, pairs: IntArray) -> tuple[FloatArray, Flo
     return normals, distances
 
 
-def _pairs_meet(
-    table: LineTable, pairs: IntArray, normals: FloatArray, offsets: FloatArray, tolerance_px: float
+def _meet(
+    points: FloatArray,
+    by_across: FloatArray,
+    normals: FloatArray,
+    offsets: FloatArray,
+    tolerance_px: float,
 ) -> BoolArray:
-    """Return the mask of pairs (P,) that lie in their plane to within the tolerance."""
-    distance = np.abs(
-        np.einsum("pi,pski->psk", normals, table.points[pairs]) - offsets[:, None, None]
-    )
-    gain = np.abs(np.einsum("pi,pski->psk", normals, table.by_across[pairs]))
+    """Return the mask of pairs (P,) of lines that lie in their plane to within the tolerance."""
+    distance = np.abs(np.einsum("pi,pski->psk", normals, points) - offsets[:, None, None])
+    gain = np.abs(np.einsum("pi,pski->psk", normals, by_across))
     meet: BoolArray = np.all(distance <= tolerance_px * gain, axis=(1, 2))
     return meet
 
 
-def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> float:
+def _meeting_rate(table: LineTable, pairs: IntArray) -> float:
     """Return the rate at which pairs (P, 2) of lines meet after a random shift of one.
 
     Parallel lines always meet; the rate falls with the angle between them.
@@ -571,20 +518,14 @@ def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> flo
         return 0.0
     rng = np.random.default_rng(1)
     some = pairs[rng.permutation(len(pairs))[: _ACCIDENTS.max_moved]]
+    by_across = table.by_across[some]
     met = 0
     for _ in range(_ACCIDENTS.n_moves):
         moves = rng.uniform(-_ACCIDENTS.moved_px, _ACCIDENTS.moved_px, len(some))[:, None, None]
-        points = table.points[some].copy()
-        points[:, 1] += moves * table.by_across[some[:, 1]]
-        moved = replace(
-            table,
-            points=points.reshape(-1, 3, 3),
-            by_across=table.by_across[some].reshape(-1, 3, 3),
-        )
-        own = np.arange(2 * len(some)).reshape(-1, 2)
-        met += int(
-            np.count_nonzero(_pairs_meet(moved, own, *_planes_of_pairs(moved, own), tolerance_px))
-        )
+        points = table.points[some]
+        points[:, 1] += moves * by_across[:, 1]
+        meet = _meet(points, by_across, *_planes_of_pairs(points), table.tolerance_px)
+        met += int(np.count_nonzero(meet))
     return (met + 1.0) / (_ACCIDENTS.n_moves * len(some) + 1.0)
 
 
@@ -596,13 +537,6 @@ def _same_surfaces(planes: Sequence[Plane]) -> BoolArray:
     apart = np.abs(np.abs(offsets[:, None]) - np.abs(offsets[None]))
     same: BoolArray = (sine < _SAME_NORMAL) & (apart < _SAME_OFFSET)
     return same
-
-
-def _on_two_surfaces(pooled: PooledStripes, patches: IntArray) -> bool:
-    some = np.unique(patches)
-    if len(some) < 2:
-        return False
-    return not bool(np.all(_same_surfaces([pooled.patch_planes[i] for i in some])))
 
 
 def fitted_plane(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from aqualvs.calibration.lasers.covariance import JointResult
 from aqualvs.calibration.lasers.laser_assignment import JudgedPlane, LaserAssignment, PlaneVerdict
 from aqualvs.calibration.lasers.problem import LaserProblem, LaserState, distances_of
 from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, way_along
@@ -21,6 +20,7 @@ from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
 from aqualvs.calibration.solver.initial_pose import target_pose
 from aqualvs.calibration.solver.least_squares import Solution
 from aqualvs.calibration.solver.result import rms_px
+from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
@@ -68,9 +68,8 @@ class ViewFigures:
     # middle of the corners.
     pose_angle: float
     pose_shift: float
-    # Shape (N, 2): measured corners, and their residuals.
-    corners_px: FloatArray
-    corner_residuals_px: FloatArray
+    corners: View  # Measured corners.
+    corner_residuals_px: FloatArray  # Shape (N, 2).
     # Shape (N,): inlier corners.
     corner_inliers: BoolArray
 
@@ -123,14 +122,20 @@ class SolvedLasers:
 
 
 def laser_figures(
-    solved: SolvedLasers, joint: JointResult, i_laser: int, laser: Laser, paper: Plane, words: str
+    solved: SolvedLasers,
+    covariance: FloatArray,
+    i_laser: int,
+    laser: Laser,
+    paper: Plane,
+    words: str,
 ) -> LaserFigures:
-    """Return the figures of a laser; `paper` and `words` become its `paper_plane` and `sheet`."""
+    """Return the figures of a laser; `paper` and `words` become its `paper_plane` and `sheet`.
+
+    `covariance` (3, 3): of its plane.
+    """
     mine = solved.groups_of(laser=i_laser)
-    groups = [solved.problem.groups[i] for i in mine]
     residuals, inside, weights, metres = _stripes(solved, mine)
-    covariance = joint.lasers[3 * i_laser : 3 * i_laser + 3, 3 * i_laser : 3 * i_laser + 3]
-    on = sorted({int(s) for group in groups for s in group.surface})
+    on = sorted({int(s) for i in mine for s in solved.problem.groups[i].surface})
     return LaserFigures(
         laser=laser,
         sigma_normal=float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])),
@@ -148,14 +153,13 @@ def _stripes(
     solved: SolvedLasers, groups: Sequence[int]
 ) -> tuple[FloatArray, BoolArray, IntArray, FloatArray]:
     """Return residuals (px), inlier mask, counts and distances (m) of groups' bins."""
-    parts = [solved.stripe_residuals_px(i) for i in groups]
-    none = np.zeros(0)
-    residuals = np.concatenate([none, *[p[0] for p in parts]])
-    inside = np.concatenate([np.zeros(0, np.bool_), *[p[1] for p in parts]])
-    members = [solved.problem.groups[i] for i in groups]
-    weights = np.concatenate([np.zeros(0, np.int64), *[g.counts for g in members]])
-    distances = [distances_of(solved.problem, solved.state, g) for g in members]
-    return residuals, inside, weights, np.concatenate([none, *distances])
+    parts = [(np.zeros(0), np.zeros(0, np.bool_), np.zeros(0, np.int64), np.zeros(0))]
+    for i in groups:
+        group = solved.problem.groups[i]
+        metres = distances_of(solved.problem, solved.state, group)
+        parts.append((*solved.stripe_residuals_px(i), group.counts, metres))
+    residuals, inside, weights, metres = map(np.concatenate, zip(*parts, strict=True))
+    return residuals, inside, weights, metres
 
 
 def _rms(values: FloatArray, weights: IntArray) -> float:
@@ -184,7 +188,7 @@ def view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFig
         n_stripe_points=len(view.placed),
         pose_angle=angle,
         pose_shift=shift,
-        corners_px=view.view.pixels,
+        corners=view.view,
         corner_residuals_px=corners,
         corner_inliers=inside,
     )
@@ -196,11 +200,9 @@ def match_to_rig(rig: Rig, planes: Sequence[Plane]) -> list[int | None]:
     None for lasers that are left over where there are fewer planes.
     """
     costs = np.array([[_apart(laser.plane, plane) for plane in planes] for laser in rig.lasers])
-    matched: list[int | None] = [None] * len(rig.lasers)
-    if costs.size:
-        for i_laser, i_plane in zip(*linear_sum_assignment(costs), strict=True):
-            matched[int(i_laser)] = int(i_plane)
-    return matched
+    pairs = zip(*linear_sum_assignment(costs), strict=True) if costs.size else ()
+    matched = {int(i_laser): int(i_plane) for i_laser, i_plane in pairs}
+    return [matched.get(i) for i in range(len(rig.lasers))]
 
 
 def far_apart(laser: Laser, plane: Plane) -> bool:
@@ -271,17 +273,8 @@ def _apart(a: Plane, b: Plane) -> float:
     return float(np.hypot(angle, (a.offset - b.offset) / far_offset))
 
 
-# Ratio of the corners' residuals with stripes to those without from which they contradict each
-# other; ratio of the stripes' residuals from a plane to those from lines from which they do.
-_CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
-_MIN_BINS = 5
-
-
 def check_size(views: Sequence[LaserView]) -> None:
-    """Refuse targets whose size indicates a wrong unit.
-
-    Raises `CalibrationError` if so.
-    """
+    """Raise `CalibrationError` for targets whose size indicates a wrong unit."""
     points = [v.view.points for v in views if len(v.view)]
     if not points:
         return
@@ -297,10 +290,7 @@ def check_size(views: Sequence[LaserView]) -> None:
 
 
 def check_poses(views: Sequence[PlacedView]) -> None:
-    """Refuse pictures with corners that contradict the rig, the medium or the target's file.
-
-    Raises `CalibrationError` if so.
-    """
+    """Raise `CalibrationError` if corners contradict the rig, the medium or the target's file."""
     misses = float(np.median([view.rms_px for view in views]))
     # Larger than any error of detection, in pixels.
     impossible_px = 2.0
@@ -312,21 +302,9 @@ def check_poses(views: Sequence[PlacedView]) -> None:
 
 
 def check_medium(views: Sequence[PlacedView], rig: Rig, seen_rig: Rig) -> None:
-    """Refuse pictures whose corners fit the other medium, air or the rig's water, far better.
+    """Raise `CalibrationError` if corners fit the other medium, air or the rig's water, far better.
 
-    Parameters
-    ----------
-    views : sequence of PlacedView
-        Placed in the stated medium.
-    rig : Rig
-        Before the calibration.
-    seen_rig : Rig
-        In the stated medium.
-
-    Raises
-    ------
-    CalibrationError
-        If so.
+    Views were placed in the stated medium, in which `seen_rig` is.
     """
     if rig.housing is None:
         return
@@ -353,10 +331,7 @@ def check_medium(views: Sequence[PlacedView], rig: Rig, seen_rig: Rig) -> None:
 
 
 def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
-    """Refuse stripes at distances that indicate a wrong unit, or no stripes on the target.
-
-    Raises `CalibrationError` if so.
-    """
+    """Raise `CalibrationError` if no stripes are on the target, or at distances of a wrong unit."""
     if not any(len(view.placed) for view in views):
         raise CalibrationError(
             f"{views[0].view.name}: no stripe lies on the target's surfaces; switch the lasers on, "
@@ -387,8 +362,15 @@ def check_count(
     whether planes of light are lasers.
     """
     found = len(split.planes)
+    # By patch.
+    places = [f"{view.view.name}, plane '{name}'" for view in views for name in surfaces.names]
+    wanted = "on two places of the board that differ"
+    remedy = "add pictures with the board nearer, farther or tilted another way"
+    if len(surfaces.planes) > 1:
+        wanted = "on two planes of the box"
+        remedy = "add pictures in which every stripe crosses from one plane to another"
     if found < (expected or 1):
-        raise CalibrationError(_too_few(split, expected, rig, views, surfaces))
+        raise CalibrationError(f"{_too_few(split, expected, rig, places, wanted)}{remedy}")
     if expected is not None and found > expected:
         raise CalibrationError(
             f"more lasers are seen than {expected}: {found} planes of light explain the stripes; "
@@ -399,8 +381,7 @@ def check_count(
         raise CalibrationError(
             f"{found} {'laser is' if found == 1 else 'lasers are'} certain, but {several} of light "
             "may also be from lasers: "
-            f"{_planes(split.undecided, views, surfaces)}; give their number (--lasers N), or "
-            f"{_remedy(surfaces)}"
+            f"{_planes(split.undecided, places)}; give their number (--lasers N), or {remedy}"
         )
     named_planes = [
         plane
@@ -408,11 +389,11 @@ def check_count(
         if plane.verdict is PlaneVerdict.OTHER or plane in split.undecided
     ]
     words = [
-        f"a plane of light ({_plane(plane, views, surfaces)}) is not taken for a laser: {plane.why}"
+        f"a plane of light ({_plane(plane, places)}) is not taken for a laser: {plane.why}"
         for plane in named_planes
     ]
     # Their stripes need no further remark; those of other planes do.
-    taken = [line for plane in named_planes for line in plane.members.tolist()]
+    taken = [line for plane in named_planes for line in plane.candidate.members.tolist()]
     counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
     # Share of the weakest laser's points in a picture from which a further stripe is reported.
     as_strong = 0.5
@@ -429,25 +410,22 @@ def check_count(
         rest = "belongs" if alone else f"and {len(unmatched) - 1} shorter ones belong"
         words.append(
             f"a stripe of {len(longest.members)} points "
-            f"({_where(longest.patch, views, surfaces)}) {rest} to no laser; "
+            f"({places[longest.patch]}) {rest} to no laser; "
             f"perhaps {'a reflection' if alone else 'reflections'}"
         )
     return words
 
 
-def _planes(
-    planes: Sequence[JudgedPlane], views: Sequence[PlacedView], surfaces: TargetSurfaces
-) -> str:
-    some = [f"{_plane(plane, views, surfaces)}: {plane.why}" for plane in planes[:3]]
+def _planes(planes: Sequence[JudgedPlane], places: Sequence[str]) -> str:
+    some = [f"{_plane(plane, places)}: {plane.why}" for plane in planes[:3]]
     more = [f"and {len(planes) - 3} more"] if len(planes) > 3 else []
     return "; ".join(some + more)
 
 
-def _plane(plane: JudgedPlane, views: Sequence[PlacedView], surfaces: TargetSurfaces) -> str:
+def _plane(plane: JudgedPlane, places: Sequence[str]) -> str:
     """Return the number of a plane's points and the pictures it is seen in."""
-    patches = plane.patches
-    rest = f" and {len(patches) - 1} more" if len(patches) > 1 else ""
-    return f"{len(plane.members)} points in {_where(patches[0], views, surfaces)}{rest}"
+    rest = f" and {len(plane.patches) - 1} more" if len(plane.patches) > 1 else ""
+    return f"{len(plane.candidate.members)} points in {places[plane.patches[0]]}{rest}"
 
 
 def typical_corner_error_px(views: Sequence[PlacedView]) -> float:
@@ -461,20 +439,27 @@ def contradicts(solved: SolvedLasers) -> bool:
     Then stripes shift the board from its pose by corners alone, or stripes do not fit one plane
     although each is straight.
     """
+    # Ratio of the corners' residuals with stripes to those without from which they contradict each
+    # other; ratio of the stripes' residuals from a plane to those from lines from which they do.
+    corners_contradict, stripes_contradict = 1.5, 3.0
+    n_groups = len(solved.problem.groups)
+    blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
+    squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
+    corners_px = float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
     alone_px = float(np.sqrt(np.mean([view.rms_px**2 for view in solved.views])))
     return (
-        _corners_px(solved) / alone_px > _CORNERS_CONTRADICT
-        or _stripes_misfit(solved) > _STRIPES_CONTRADICT
+        corners_px / alone_px > corners_contradict or _stripes_misfit(solved) > stripes_contradict
     )
 
 
 def _stripes_misfit(solved: SolvedLasers) -> float:
     """Return the ratio of the stripes' residuals from their plane to those from straight lines."""
     from_plane = from_line = 0.0
+    min_bins = 5
     for i, group in enumerate(solved.problem.groups):
         residuals, _ = solved.stripe_residuals_px(i)
         seen = np.isfinite(residuals)
-        if np.count_nonzero(seen) < _MIN_BINS:
+        if np.count_nonzero(seen) < min_bins:
             continue
         weights = 1.0 / group.sigma_px[seen]
         way = way_along(group.pixels[seen])
@@ -498,20 +483,10 @@ def loose_text(solved: SolvedLasers) -> str:
     )
 
 
-def _corners_px(solved: SolvedLasers) -> float:
-    n_groups = len(solved.problem.groups)
-    blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
-    squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
-    return float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
-
-
 def _too_few(
-    split: LaserAssignment,
-    expected: int | None,
-    rig: Rig,
-    views: Sequence[PlacedView],
-    surfaces: TargetSurfaces,
+    split: LaserAssignment, expected: int | None, rig: Rig, places: Sequence[str], wanted: str
 ) -> str:
+    """Return which lasers cannot be solved, with what is undecided; `wanted` is where."""
     which = ""
     if split.planes and len(rig.lasers) == expected:
         matched = match_to_rig(rig, split.planes)
@@ -521,27 +496,10 @@ def _too_few(
     seen = "none of the" if none else f"{len(split.planes)} of {expected}"
     lonely = ""
     if split.unmatched:
-        where = sorted({_where(line.patch, views, surfaces) for line in split.unmatched[:4]})
+        where = sorted({places[line.patch] for line in split.unmatched[:4]})
         what = "seen on one plane only" if len(where) == 1 else "that no certain plane explains"
         lonely = f"; stripes {what}: {'; '.join(where)}"
-    wanted = "on two places of the board that differ"
-    if len(surfaces.planes) > 1:
-        wanted = "on two planes of the box"
     if split.possible:
-        lonely += f"; undecided: {_planes(split.possible, views, surfaces)}"
+        lonely += f"; undecided: {_planes(split.possible, places)}"
     count = "give --lasers N, how many there are, or " if split.possible and not expected else ""
-    return (
-        f"{seen} lasers can be solved{which}: each must be seen {wanted}{lonely}; "
-        f"{count}{_remedy(surfaces)}"
-    )
-
-
-def _remedy(surfaces: TargetSurfaces) -> str:
-    if len(surfaces.planes) > 1:
-        return "add pictures in which every stripe crosses from one plane to another"
-    return "add pictures with the board nearer, farther or tilted another way"
-
-
-def _where(patch: int, views: Sequence[PlacedView], surfaces: TargetSurfaces) -> str:
-    i_view, i_surface = divmod(patch, len(surfaces.planes))
-    return f"{views[i_view].view.name}, plane '{surfaces.names[i_surface]}'"
+    return f"{seen} lasers can be solved{which}: each must be seen {wanted}{lonely}; {count}"

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aqualvs.calibration.lasers.problem import N_LASER, LaserProblem, LaserState
-from aqualvs.calibration.lasers.stripes_on_planes import StripeGroup, correlation_factor
-from aqualvs.calibration.solver.least_squares import Block, Solution, inverse, normal_equations
+from aqualvs.calibration.lasers.stripes_on_planes import correlation_factor
+from aqualvs.calibration.solver.least_squares import Solution, inverse, normal_equations
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.camera import parameter_names
 from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty
@@ -37,18 +37,10 @@ class CameraCovariance:
     def of(
         cls, rig: Rig, given: RigUncertainty, n_medium: float | None, sigma_medium: float
     ) -> "CameraCovariance":
-        """Return the uncertain numbers.
+        """Return the uncertain numbers of a rig before the calibration.
 
-        Parameters
-        ----------
-        rig : Rig
-            Before the calibration.
-        given : RigUncertainty
-            Of the rig.
-        n_medium : float or None
-            Index of the medium in the pictures; None for the rig's own water.
-        sigma_medium : float
-            Its standard deviation, if it is not the rig's water.
+        `n_medium` is the index of the medium in the pictures, None for the rig's own water, and
+        `sigma_medium` its standard deviation, if it is not that water.
         """
         # Earlier knowledge of the lasers is replaced.
         given = given.only([name for name in given.names if ":" not in name])
@@ -86,16 +78,6 @@ class CameraCovariance:
         return crossed
 
 
-@dataclass(frozen=True, slots=True)
-class JointResult:
-    """Covariances of a solved problem."""
-
-    # Of all given numbers and all lasers' planes together; windows are taken as given.
-    uncertainty: RigUncertainty
-    # Shape (3 L, 3 L): covariance of the lasers' planes.
-    lasers: FloatArray
-
-
 def joint_uncertainty(
     solution: Solution[LaserState],
     problem: LaserProblem,
@@ -104,21 +86,19 @@ def joint_uncertainty(
     *,
     refined: bool,
     stripe_bias_px: float,
-) -> JointResult:
-    """Return the joint covariance of camera, medium and lasers.
+) -> tuple[RigUncertainty, list[FloatArray]]:
+    """Return the joint covariance of camera, medium and lasers, and that (3, 3) of each plane.
+
+    Windows are taken as given.
 
     Parameters
     ----------
-    solution : Solution
-        Of `problem`.
-    problem : LaserProblem
+    solution, problem
         With free uncertain numbers if `refined`, else held ones.
     camera_covariance : CameraCovariance
         Numbers that were uncertain before.
     lasers : sequence of Laser
         In the problem's order.
-    refined : bool
-        Whether the solve included the uncertain numbers.
     stripe_bias_px : float
         Standard deviation of the error that all centres of one laser's stripe share on one
         surface, across the stripe.
@@ -132,10 +112,8 @@ def joint_uncertainty(
     kept = np.concatenate([np.arange(n), mine])
     joint = _with_given(covariance[np.ix_(kept, kept)], camera_covariance)
     names = [f"{laser.name}:{name}" for laser in lasers for name in LASER_PARAMETERS]
-    return JointResult(
-        RigUncertainty((*camera_covariance.given.names, *names), joint),
-        covariance[np.ix_(mine, mine)],
-    )
+    planes = [covariance[np.ix_(one, one)] for one in np.split(mine, problem.n_lasers)]
+    return RigUncertainty((*camera_covariance.given.names, *names), joint), planes
 
 
 def _all_covariance(
@@ -163,13 +141,9 @@ def _correlation(solution: Solution[LaserState], problem: LaserProblem) -> tuple
         # The noise of stripes then includes the errors that bins share.
         return (1.0,) * problem.n_lasers
     sequences: list[list[FloatArray]] = [[] for _ in range(problem.n_lasers)]
-    n_groups = len(problem.groups)
+    # Stripes come before all other blocks.
     parts = zip(
-        problem.groups,
-        solution.blocks[:n_groups],
-        solution.inliers[:n_groups],
-        solution.block_scales[:n_groups],
-        strict=True,
+        problem.groups, solution.blocks, solution.inliers, solution.block_scales, strict=False
     )
     for group, block, inside, scale in parts:
         residuals = np.where(inside, block.residuals[:, 0] / scale, np.nan)
@@ -206,22 +180,18 @@ def _data_information(
     n_surfaces = len(problem.surfaces.planes)
     for i, group in enumerate(problem.groups):
         scales[i] *= float(np.sqrt(correlation[group.laser]))
+        # One more unknown for each surface: a shift of the stripe across, in pixels.
         first = full.n_parameters + n_surfaces * group.laser
-        taken[i] = _with_bias(taken[i], group, np.arange(first, first + n_surfaces))
+        by_bias = np.zeros((len(group), 1, n_surfaces))
+        by_bias[np.arange(len(group)), 0, group.surface] = 1.0 / group.sigma_px
+        taken[i] = replace(
+            taken[i],
+            columns=np.concatenate([taken[i].columns, np.arange(first, first + n_surfaces)]),
+            jacobian=np.concatenate([taken[i].jacobian, by_bias], axis=2),
+        )
     inliers = [solution.inliers[i] for i in then]
     n_all = full.n_parameters + n_surfaces * problem.n_lasers
     return normal_equations(n_all, taken, inliers, scales).information
-
-
-def _with_bias(block: Block, group: StripeGroup, columns: IntArray) -> Block:
-    """Return a stripe's block with one more unknown for each surface: a shift across, in pixels."""
-    by_bias = np.zeros((len(group), 1, len(columns)))
-    by_bias[np.arange(len(group)), 0, group.surface] = 1.0 / group.sigma_px
-    return replace(
-        block,
-        columns=np.concatenate([block.columns, columns]),
-        jacobian=np.concatenate([block.jacobian, by_bias], axis=2),
-    )
 
 
 def _consider_covariance(
@@ -246,7 +216,10 @@ def _with_given(covariance: FloatArray, camera_covariance: CameraCovariance) -> 
     """
     n, n_given = camera_covariance.n_columns, len(camera_covariance.given.names)
     crossed = camera_covariance.with_given()
-    follow = crossed.T @ _pseudo_inverse(camera_covariance.covariance)
+    sigma = np.sqrt(np.diag(camera_covariance.covariance))
+    # Units have many sizes, and numbers may be dependent.
+    size = np.outer(sigma, sigma)
+    follow = crossed.T @ (np.linalg.pinv(camera_covariance.covariance / size, rcond=1e-10) / size)
     joint = np.empty((n_given + len(covariance) - n,) * 2)
     rest = camera_covariance.given.covariance - follow @ crossed
     joint[:n_given, :n_given] = rest + follow @ covariance[:n, :n] @ follow.T
@@ -254,11 +227,3 @@ def _with_given(covariance: FloatArray, camera_covariance: CameraCovariance) -> 
     joint[n_given:, :n_given] = joint[:n_given, n_given:].T
     joint[n_given:, n_given:] = covariance[n:, n:]
     return 0.5 * (joint + joint.T)
-
-
-def _pseudo_inverse(covariance: FloatArray) -> FloatArray:
-    """Invert a covariance with units of many sizes and possibly dependent numbers."""
-    sigma = np.sqrt(np.diag(covariance))
-    size = np.outer(sigma, sigma)
-    inverted: FloatArray = np.linalg.pinv(covariance / size, rcond=1e-10) / size
-    return inverted

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.calibration.lasers.candidates import (
+    LineTable,
     PlaneCandidate,
     StripeLine,
     find_candidates,
@@ -22,7 +23,7 @@ from aqualvs.calibration.lasers.candidates import (
     ordered_candidates,
     plane_residuals_px,
 )
-from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledStripes
+from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
@@ -59,80 +60,44 @@ class JudgedPlane:
     """Plane of light with the verdict on it."""
 
     candidate: PlaneCandidate
-    members: IntArray  # Shape (M,): indices of its points.
     patches: tuple[int, ...]  # Surfaces of views that it is seen on.
     verdict: PlaneVerdict
     why: str = ""  # In words, the reason why it is no laser or may be none; empty for lasers.
 
 
 def judged(
-    pooled: PooledStripes,
-    lines: Sequence[StripeLine],
-    candidates: Sequence[PlaneCandidate],
-    lens_in_dome: FloatArray,
+    table: LineTable, candidates: Sequence[PlaneCandidate], lens_in_dome: FloatArray
 ) -> list[JudgedPlane]:
-    """Judge planes by their evidence, and by each other.
+    """Judge planes by their evidence, and by each other; return them by verdict and evidence.
 
-    Parameters
-    ----------
-    pooled : PooledStripes
-        Points of all views.
-    lines : sequence of StripeLine
-        Of all surfaces.
-    candidates : sequence of PlaneCandidate
-        As returned by `find_candidates`.
-    lens_in_dome : array, shape (3,)
-        The lens's projection centre.
-
-    Returns
-    -------
-    list of JudgedPlane
-        By verdict, then by evidence.
+    `candidates`: the best first. `lens_in_dome`, shape (3,): the lens's projection centre.
     """
-    alarms = np.array([c.log_false_alarms for c in candidates])
-    n_sure = _n_sure(alarms)
-    stay = _stay_in_picture(pooled, lines, candidates, lens_in_dome)
+    pooled = table.pooled
+    # The best planes within the allowed false discovery rate.
+    alarms = np.sort([c.log_false_alarms for c in candidates])
+    allowed = _SURE.false_share * np.arange(1, len(alarms) + 1)
+    n_sure = int(np.flatnonzero(np.exp(alarms) <= allowed).max(initial=-1)) + 1
+    stay = _stay_in_picture(pooled, candidates, lens_in_dome)
+    # Planes with light on the target are judged before those beside it.
+    beside = [float(np.mean(pooled.on_target[c.members])) < 1.0 - _SURE.most for c in candidates]
     seen: list[JudgedPlane] = []
-    for i in _by_target(pooled, lines, candidates):
-        candidate = candidates[i]
-        members = _members(lines, candidate)
-        fault = _fault(pooled, candidate, members, seen)
+    for i in sorted(range(len(candidates)), key=lambda i: (beside[i], i)):
+        fault = _fault(pooled, candidates[i], seen)
         if stay[i]:
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to distinguish it from chance"
-        verdict, why = fault or (PlaneVerdict.LASER, "")
-        patches = tuple(np.unique(pooled.patch[members]).tolist())
-        seen.append(JudgedPlane(candidate, members, patches, verdict, why))
+        patches = tuple(np.unique(pooled.patch[candidates[i].members]).tolist())
+        seen.append(JudgedPlane(candidates[i], patches, *(fault or (PlaneVerdict.LASER, ""))))
     ranks = list(PlaneVerdict)
     return sorted(seen, key=lambda j: (ranks.index(j.verdict), j.candidate.log_false_alarms))
 
 
-def _n_sure(log_alarms: FloatArray) -> int:
-    """Return the number of best planes within the allowed false discovery rate."""
-    allowed = _SURE.false_share * np.arange(1, len(log_alarms) + 1)
-    good = np.flatnonzero(np.exp(np.sort(log_alarms)) <= allowed)
-    return int(good[-1]) + 1 if len(good) else 0
-
-
-def _members(lines: Sequence[StripeLine], candidate: PlaneCandidate) -> IntArray:
-    return np.concatenate([lines[int(i)].members for i in candidate.lines])
-
-
-def _by_target(
-    pooled: PooledStripes, lines: Sequence[StripeLine], candidates: Sequence[PlaneCandidate]
-) -> list[int]:
-    """Return the order of judging: planes with light on the target before those beside it."""
-    beside = [
-        float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _SURE.most for c in candidates
-    ]
-    return sorted(range(len(candidates)), key=lambda i: (beside[i], i))
-
-
 def _fault(
-    pooled: PooledStripes, candidate: PlaneCandidate, members: IntArray, seen: Sequence[JudgedPlane]
+    pooled: PooledStripes, candidate: PlaneCandidate, seen: Sequence[JudgedPlane]
 ) -> tuple[PlaneVerdict, str] | None:
     """Return the reason against a plane as a laser of its own, or None."""
+    members = candidate.members
     if len(members) < _SURE.min_points:
         return PlaneVerdict.OTHER, f"it has {len(members)} points only"
     if _is_fixed(pooled, members):
@@ -141,11 +106,10 @@ def _fault(
             "camera sideways, or turn it, between pictures"
         )
     for other in seen:
-        if other.verdict is PlaneVerdict.OTHER:
-            continue
-        fault = _same_light(pooled, members, other)
-        if fault is not None:
-            return fault
+        if other.verdict is not PlaneVerdict.OTHER:
+            fault = _same_light(pooled, members, other)
+            if fault is not None:
+                return fault
     best = min(
         (other.candidate.residual_px for other in seen if other.verdict is PlaneVerdict.LASER),
         default=np.inf,
@@ -178,7 +142,7 @@ def _same_light(
         return PlaneVerdict.TORN, (
             f"it is {distance:.0f} px away from a laser that is seen in other pictures"
         )
-    goes_on = sum(_goes_on(pooled, members, other.members, patch) for patch in shared)
+    goes_on = sum(_goes_on(pooled, members, other.candidate.members, patch) for patch in shared)
     if len(shared) >= 2 and goes_on >= _SURE.most * len(mine):
         return (
             PlaneVerdict.OTHER,
@@ -212,10 +176,7 @@ def _direction(points: FloatArray) -> FloatArray:
 
 
 def _stay_in_picture(
-    pooled: PooledStripes,
-    lines: Sequence[StripeLine],
-    candidates: Sequence[PlaneCandidate],
-    lens_in_dome: FloatArray,
+    pooled: PooledStripes, candidates: Sequence[PlaneCandidate], lens_in_dome: FloatArray
 ) -> BoolArray:
     """Mark planes (C,) whose stripe stays in one place of the picture, near or far.
 
@@ -232,7 +193,7 @@ def _stay_in_picture(
     near = np.zeros(len(candidates), np.bool_)
     own_px, fixed_px = np.zeros((2, len(candidates)))
     for i, candidate in enumerate(candidates):
-        members, plane = _members(lines, candidate), candidate.plane
+        members, plane = candidate.members, candidate.plane
         near[i] = abs(float(plane.signed_distance(lens_in_dome))) < min_baseline
         fixed = fitted_plane(pooled.placed, members, plane, through=lens_in_dome)
         away = np.abs(plane_residuals_px(pooled.placed, [plane, fixed])[members])
@@ -244,8 +205,7 @@ def _stay_in_picture(
 
 def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
     """Return whether the points stay on one line of each surface of the target in all views."""
-    worst = 0.0
-    several = False
+    worst, several = 0.0, False
     for surface in np.unique(pooled.placed.surface[members]):
         mine = members[pooled.placed.surface[members] == surface]
         views = np.unique(pooled.view[mine])
@@ -323,35 +283,31 @@ def assign_lasers(
 ) -> LaserAssignment:
     """Assign stripe points to the laser planes that they lie in.
 
-    Parameters
-    ----------
-    pooled : PooledStripes
-        Points of all views.
-    lens_in_dome : array, shape (3,)
-        The lens's projection centre; a plane through it is no laser.
-    n_lasers : int, optional
-        Number of lasers that shine; by default all planes with clear evidence.
-    tolerance_px : float
-        Greatest distance of a stripe from its plane.
-
-    Returns
-    -------
-    LaserAssignment
-        All planes with clear evidence, even more than `n_lasers`. If there are fewer, also the best
-        undecided ones, if they are clearly better than the other undecided ones.
+    The lasers are all planes with clear evidence, even more than `n_lasers`, the number that shine.
+    If there are fewer, they are also the best undecided ones, if these are clearly better than the
+    other undecided ones. A plane through the lens's projection centre, `lens_in_dome` (3,), is no
+    laser. `tolerance_px` is the greatest distance of a stripe from its plane.
     """
     lines = _all_lines(pooled)
-    found = judged(pooled, lines, find_candidates(pooled, lines, tolerance_px), lens_in_dome)
+    table = LineTable.of(pooled, lines, tolerance_px)
+    found = judged(table, find_candidates(table), lens_in_dome)
     taken = [plane for plane in found if plane.verdict is PlaneVerdict.LASER]
     if n_lasers is not None and len(taken) < n_lasers:
-        side_by_side = ordered_candidates(pooled, lines, n_lasers, tolerance_px)
-        ordered = judged(pooled, lines, side_by_side, lens_in_dome)
+        ordered = judged(table, ordered_candidates(table, n_lasers), lens_in_dome)
         if ordered and all(plane.verdict is PlaneVerdict.LASER for plane in ordered):
             found = taken = ordered
     in_planes = {int(i) for plane in found for i in plane.candidate.lines}
     lonely = [len(line.members) for i, line in enumerate(lines) if i not in in_planes]
     longest = max(lonely, default=0)
-    perhaps = [plane for plane in found if _may_be_laser(plane, lines, longest)]
+    # Planes that can be lasers if more are known to shine: not if a much longer stripe is in no
+    # plane, as that may be the laser then, seen on one surface only.
+    perhaps = [
+        plane
+        for plane in found
+        if plane.verdict in (PlaneVerdict.WEAK, PlaneVerdict.DOUBTFUL)
+        and plane.candidate.log_false_alarms <= _TOLD
+        and longest <= _LONGER * max(len(lines[int(i)].members) for i in plane.candidate.lines)
+    ]
     missing = 0 if n_lasers is None else max(n_lasers - len(taken), 0)
     if 0 < missing <= len(perhaps):
         best, rest = perhaps[:missing], perhaps[missing:]
@@ -360,18 +316,14 @@ def assign_lasers(
     planes = _refined(pooled, [plane.candidate.plane for plane in taken], tolerance_px)
     laser = assigned(pooled, planes, tolerance_px)
     spare = tuple(plane for plane in found if plane not in taken)
-    return LaserAssignment(tuple(planes), laser, _unmatched(lines, laser), spare)
-
-
-def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int) -> bool:
-    """Return whether a plane can be a laser if more are known to shine.
-
-    Not if a much longer stripe, of `longest` points, is in no plane: that may be the laser then,
-    seen on one surface only.
-    """
-    perhaps = plane.verdict in (PlaneVerdict.WEAK, PlaneVerdict.DOUBTFUL)
-    own = max(len(lines[int(i)].members) for i in plane.candidate.lines)
-    return perhaps and plane.candidate.log_false_alarms <= _TOLD and longest <= _LONGER * own
+    # Lines with hardly any point assigned to a laser.
+    unmatched = [
+        line
+        for line in lines
+        if len(line.members) >= _SURE.min_points and np.mean(laser[line.members] >= 0) < 0.2
+    ]
+    unmatched.sort(key=lambda line: -len(line.members))
+    return LaserAssignment(tuple(planes), laser, tuple(unmatched), spare)
 
 
 def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
@@ -383,35 +335,20 @@ def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
 
 
 def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
-    lines = []
-    n_of_chain = _counts_on_patch(pooled)
+    # Number of points of each point's chain on its surface.
+    key = pooled.patch * (int(pooled.chain.max(initial=-1)) + 1) + pooled.chain
+    _, place, counts = np.unique(key, return_inverse=True, return_counts=True)
+    n_of_chain = counts[place]
     # Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
     min_of_chain = 0.25
+    lines = []
     for patch in range(len(pooled.patch_planes)):
-        members = np.flatnonzero(pooled.patch == patch)
-        lines += [
-            line
-            for line in lines_on_patch(pooled, members, patch)
-            if _share_of_chains(pooled, line, n_of_chain) >= min_of_chain
-        ]
+        for line in lines_on_patch(pooled, np.flatnonzero(pooled.patch == patch), patch):
+            chains, at = np.unique(pooled.chain[line.members], return_inverse=True)
+            mine = np.bincount(at, minlength=len(chains))[at]
+            if np.mean(mine / n_of_chain[line.members]) >= min_of_chain:
+                lines.append(line)
     return lines
-
-
-def _counts_on_patch(pooled: PooledStripes) -> IntArray:
-    """Return for each point (N,) the number of points of its chain on its surface."""
-    n_chains = int(pooled.chain.max(initial=-1)) + 1
-    _, place, counts = np.unique(
-        pooled.patch * n_chains + pooled.chain, return_inverse=True, return_counts=True
-    )
-    n_of_chain: IntArray = counts[place]
-    return n_of_chain
-
-
-def _share_of_chains(pooled: PooledStripes, line: StripeLine, n_of_chain: IntArray) -> float:
-    """Return the share of its chains' points that a line holds, as the mean over its points."""
-    chains, place = np.unique(pooled.chain[line.members], return_inverse=True)
-    mine = np.bincount(place, minlength=len(chains))[place]
-    return float(np.mean(mine / n_of_chain[line.members]))
 
 
 def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) -> list[Plane]:
@@ -437,25 +374,12 @@ def assigned(
     residuals = np.abs(plane_residuals_px(pooled.placed, planes))
     nearest = np.argmin(residuals, axis=1)
     clear = residuals[np.arange(n), nearest] <= tolerance_px
-    clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _SURE.crossing_px, axis=1) <= 1
-    return np.where(clear, nearest, -1)
-
-
-def _crossed_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:
-    """Return distances (N, L) of points from the planes' cuts with their surface, in pixels."""
-    normals = np.array([p.normal for p in planes])
+    # Distances (N, L) of points from the planes' cuts with their surface.
+    placed, normals = pooled.placed, np.array([p.normal for p in planes])
     offsets = np.array([p.offset for p in planes])
     gain = np.hypot(placed.by_across @ normals.T, placed.by_along @ normals.T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance: FloatArray = np.abs(placed.points_in_dome @ normals.T - offsets) / gain
-    return np.nan_to_num(distance, nan=np.inf)
-
-
-def _unmatched(lines: Sequence[StripeLine], laser: IntArray) -> tuple[StripeLine, ...]:
-    """Return lines with hardly any point assigned to a laser."""
-    free = [
-        line
-        for line in lines
-        if len(line.members) >= _SURE.min_points and np.mean(laser[line.members] >= 0) < 0.2
-    ]
-    return tuple(sorted(free, key=lambda line: -len(line.members)))
+        crossed_px = np.abs(placed.points_in_dome @ normals.T - offsets) / gain
+    # NaN compares false.
+    clear &= np.count_nonzero(crossed_px <= _SURE.crossing_px, axis=1) <= 1
+    return np.where(clear, nearest, -1)

@@ -8,6 +8,7 @@ stripe, as it was measured. It depends on the target's pose, the camera's number
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,8 +58,7 @@ class LaserState:
     board_poses: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Distances:
+class _Distances(NamedTuple):
     """Distances of a group's points (N) from their sheet, with derivatives."""
 
     distance: FloatArray
@@ -113,17 +113,11 @@ class LaserProblem:
         blocks += self.bundle.blocks(state.bundle)
         if self.board_pose_prior is not None:
             sigma = self.board_pose_prior.sigmas
-            blocks += [
-                Block(
-                    BOARD_POSES,
-                    self.board_pose_columns(i),
-                    (row / sigma)[None],
-                    np.diag(1.0 / sigma)[None],
-                    RobustLoss.SQUARE,
-                    scaled=False,
-                )
-                for i, row in enumerate(state.board_poses)
-            ]
+            for i, row in enumerate(state.board_poses):
+                columns, off = self.board_pose_columns(i), (row / sigma)[None]
+                slopes = np.diag(1.0 / sigma)[None]
+                square = RobustLoss.SQUARE
+                blocks.append(Block(BOARD_POSES, columns, off, slopes, square, scaled=False))
         return blocks
 
     def moved(self, state: LaserState, step: FloatArray) -> LaserState:
@@ -157,10 +151,8 @@ class LaserProblem:
     def _seen(self, state: LaserState, camera: Camera) -> list[tuple[FloatArray, FloatArray]]:
         """Return for every group its points and their derivatives, see `_moves`."""
         found: dict[int, tuple[FloatArray, FloatArray]] = {}
-        for i_view in range(len(self.bundle.views)):
+        for i_view in sorted({group.view for group in self.groups}):
             mine = [i for i, group in enumerate(self.groups) if group.view == i_view]
-            if not mine:
-                continue
             groups = [self.groups[i] for i in mine]
             pixels = np.concatenate([group.pixels for group in groups])
             surface = np.concatenate([group.surface for group in groups])
@@ -174,10 +166,9 @@ class LaserProblem:
     def _lit(self, state: LaserState, points: Sequence[FloatArray]) -> list[_Distances]:
         """Return for every group the distances of its points from their sheet, with derivatives."""
         found: dict[int, _Distances] = {}
-        for i_laser, sheet in enumerate(state.sheets):
+        for i_laser in sorted({group.laser for group in self.groups}):
+            sheet = state.sheets[i_laser]
             mine = [i for i, group in enumerate(self.groups) if group.laser == i_laser]
-            if not mine:
-                continue
             distance, by_point, by_laser = sheet.signed_distance_with_parameter_jacobian(
                 np.concatenate([points[i] for i in mine])
             )
@@ -186,13 +177,8 @@ class LaserProblem:
                 by_water = by_laser[:, sheet.parameter_names.index("n_water")]
             by_air = -by_water * (sheet.n_water / sheet.n_air)
             for i, rows in zip(mine, _rows([self.groups[i] for i in mine]), strict=True):
-                found[i] = _Distances(
-                    distance[rows],
-                    by_point[rows],
-                    by_laser[rows, :N_LASER],
-                    by_water[rows],
-                    by_air[rows],
-                )
+                of_group = (distance, by_point, by_laser[:, :N_LASER], by_water, by_air)
+                found[i] = _Distances(*(values[rows] for values in of_group))
         return [found[i] for i in range(len(self.groups))]
 
     def _stripe_block(self, group: StripeGroup, moves: FloatArray, lit: _Distances) -> Block:

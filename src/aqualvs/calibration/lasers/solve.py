@@ -42,23 +42,10 @@ from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.sheet import Sheet, sheet_in
 
 
-@dataclass(frozen=True, slots=True)
-class _Fit:
-    rms_px: float
-    n_effective: float
-
-
 def start_sheets(rig: Rig, lasers: Sequence[Laser], *, bent: bool) -> tuple[Sheet, ...]:
-    """Return the initial sheets: planes, or bent ones for lasers with a window.
+    """Return the initial sheets: planes, or, if `bent`, bent ones for lasers with a window.
 
-    Parameters
-    ----------
-    rig : Rig
-        In the medium of the pictures.
-    lasers : sequence of Laser
-        `plane` fits the light in that medium.
-    bent : bool
-        Whether sheets behind windows are bent.
+    The lasers' planes fit the light in the medium of the pictures, in which the rig is.
     """
     return tuple(
         _bent(rig, laser)
@@ -87,25 +74,11 @@ def choose_sheets(
     lasers: Sequence[Laser],
     solve_with: Callable[[tuple[Sheet, ...]], SolvedLasers],
 ) -> tuple[SolvedLasers, list[str]]:
-    """Choose plane or bent sheet for every laser that has a window.
+    """Choose plane or bent sheet for every laser that has a window, and solve with these.
 
-    Parameters
-    ----------
-    flat : SolvedLasers
-        With all lasers as planes.
-    rig : Rig
-        In the medium of the pictures.
-    lasers : sequence of Laser
-        With their windows, and the planes of `flat`.
-    solve_with : callable
-        Solves again with given initial sheets.
-
-    Returns
-    -------
-    solved : SolvedLasers
-        With the chosen sheets.
-    words : list of str
-        For every laser, the choice and its reason.
+    In `flat` all lasers are planes, as in `lasers`; the rig is in the medium of the pictures;
+    `solve_with` solves again with given initial sheets. The words tell the choice for every laser,
+    and its reason.
     """
     if all(laser.window is None for laser in lasers):
         return flat, ["plane"] * len(lasers)
@@ -116,17 +89,18 @@ def choose_sheets(
             chosen.append(flat.state.sheets[i])
             words.append("plane")
             continue
-        keep_window, why = _choice(_fit(flat, i), _fit(bent, i))
+        keep_window, why = _choice(flat, bent, i)
         chosen.append((bent if keep_window else flat).state.sheets[i])
         words.append(why)
     return solve_with(tuple(chosen)), words
 
 
-def _choice(flat: _Fit, bent: _Fit) -> tuple[bool, str]:
+def _choice(flat: SolvedLasers, bent: SolvedLasers, i_laser: int) -> tuple[bool, str]:
+    """Return whether the sheet of a laser is bent, and why."""
+    (flat_px, n_flat), (bent_px, n_bent) = _fit(flat, i_laser), _fit(bent, i_laser)
     # Both have three unknowns, so that only the residuals count.
-    n = min(flat.n_effective, bent.n_effective)
-    evidence = 2.0 * n * float(np.log(max(flat.rms_px, 1e-9) / max(bent.rms_px, 1e-9)))
-    residuals = f"residuals {bent.rms_px:.3f} px if bent at the window, {flat.rms_px:.3f} px if not"
+    evidence = 2.0 * min(n_flat, n_bent) * float(np.log(max(flat_px, 1e-9) / max(bent_px, 1e-9)))
+    residuals = f"residuals {bent_px:.3f} px if bent at the window, {flat_px:.3f} px if not"
     # Difference of the Bayesian information criterion that is strong evidence (Kass & Raftery 1995,
     # doi:10.1080/01621459.1995.10476572).
     strong = 6.0
@@ -137,7 +111,8 @@ def _choice(flat: _Fit, bent: _Fit) -> tuple[bool, str]:
     return True, f"bent at its window as the rig says, though stripes cannot tell: {residuals}"
 
 
-def _fit(solved: SolvedLasers, i_laser: int) -> _Fit:
+def _fit(solved: SolvedLasers, i_laser: int) -> tuple[float, float]:
+    """Return the rms of a laser's residuals, in pixels, and their number as if independent."""
     squares: list[FloatArray] = []
     sequences: list[FloatArray] = []
     for i in solved.groups_of(laser=i_laser):
@@ -149,7 +124,7 @@ def _fit(solved: SolvedLasers, i_laser: int) -> _Fit:
     everything = np.concatenate(squares)
     # A plane fitted to bent light leaves long waves; their shape counts, not the number of points.
     n_effective = len(everything) / correlation_factor(sequences)
-    return _Fit(float(np.sqrt(np.mean(everything))), n_effective)
+    return float(np.sqrt(np.mean(everything))), n_effective
 
 
 # Tilt and offset of a board of paper or foam that is fixed to a wall by hand.
@@ -174,16 +149,11 @@ class InitialGuess:
 
     def bundle(self) -> Bundle:
         """Return the bundle of the corners alone."""
-        camera_covariance = self.camera_covariance
-        return Bundle(
-            views=tuple(TargetView(v.view, 0, v.dome_from_target) for v in self.views),
-            free=() if camera_covariance is None else camera_covariance.names,
-            start=self.state(),
-            priors=RigUncertainty.none() if camera_covariance is None else camera_covariance.given,
-            media_sigma=np.array(
-                [0.0 if camera_covariance is None else camera_covariance.sigma_medium]
-            ),
-        )
+        views = tuple(TargetView(v.view, 0, v.dome_from_target) for v in self.views)
+        known = self.camera_covariance
+        if known is None:
+            return Bundle(views, (), self.state(), RigUncertainty.none(), np.zeros(1))
+        return Bundle(views, known.names, self.state(), known.given, np.array([known.sigma_medium]))
 
     def state(self) -> BundleState:
         """Return the initial guess of camera, medium and poses."""
@@ -202,20 +172,9 @@ def solve_lasers(
 ) -> tuple[SolvedLasers, list[str]]:
     """Solve lasers as planes, again with points assigned by those planes, then their sheets.
 
-    Parameters
-    ----------
-    lasers : sequence of Laser
-        `plane` fits the light in the medium of the pictures roughly.
-    laser_of : int array, shape (N,)
-        Index of the laser of each stripe point of all views; -1 for none.
-    loose : bool or None
-        As `LaserOptions.loose`.
-
-    Returns
-    -------
-    solved : SolvedLasers
-    words : list of str
-        For every laser, the chosen sheet and the reason.
+    The planes of `lasers` fit the light in the medium of the pictures roughly. `laser_of` (N,) is
+    the index of the laser of each stripe point of all views, -1 for none; `loose` is as in
+    `LaserOptions`. The words tell the chosen sheet of every laser, and the reason.
     """
     names = [laser.name for laser in lasers]
     first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of, names)
@@ -281,16 +240,9 @@ def _solve_from(
 def free_text(
     problem: LaserProblem, names: Sequence[str], views: Sequence[PlacedView], parameter: int
 ) -> str:
-    """Return the remedy for a parameter that the pictures do not determine.
+    """Return the remedy for the column of a parameter that the pictures do not determine.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Of the lasers.
-    views : sequence of PlacedView
-        The pictures.
-    parameter : int
-        Its column.
+    `names`: of the lasers.
     """
     for i, name in enumerate(names):
         if parameter in problem.laser_columns(i):
@@ -320,10 +272,7 @@ def paper_planes(solved: SolvedLasers) -> list[Plane]:
     spatial = [surfaces.placed(view.spatial.dome_from_target) for view in solved.views]
     for i, sheet in enumerate(solved.state.sheets):
         groups = [solved.problem.groups[k] for k in solved.groups_of(laser=i)]
-        points = [
-            points_on(camera, group.pixels, group.surface, spatial[group.view])[0]
-            for group in groups
-        ]
+        points = [points_on(camera, g.pixels, g.surface, spatial[g.view])[0] for g in groups]
         planes.append(like(paper_plane(np.concatenate(points)), sheet.plane))
     return planes
 

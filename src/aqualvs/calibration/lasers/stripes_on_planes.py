@@ -23,7 +23,6 @@ from aqualvs.optics.sheet import Sheet
 class StripePoints:
     """Points on laser stripes, found in one picture."""
 
-    name: str  # File name of the picture, for messages and reports.
     pixels: FloatArray  # Shape (N, 2): sub-pixel centres, in `image`.
     # Shape (N, 2): unit vectors in `image` at right angles to the stripe: a point is measured along
     # these only.
@@ -43,19 +42,10 @@ class StripePoints:
         every = -(-len(self) // n_points) if len(self) else 1
         return self if every == 1 else self.at(np.arange(0, len(self), every))
 
-    def where(self, keep: BoolArray) -> "StripePoints":
-        """Return the points that `keep` (N,) marks."""
-        return self.at(np.flatnonzero(keep))
-
     def at(self, index: IntArray) -> "StripePoints":
         """Return the points with these indices (M,)."""
-        return StripePoints(
-            self.name,
-            self.pixels[index],
-            self.across[index],
-            self.chain[index],
-            self.sigma_px[index],
-        )
+        pixels, across = self.pixels[index], self.across[index]
+        return StripePoints(pixels, across, self.chain[index], self.sigma_px[index])
 
 
 # An open side of a box ends this share of the box's size beyond the outermost marker.
@@ -115,18 +105,10 @@ class TargetSurfaces:
 def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> TargetSurfaces:
     """Return the surfaces of an open box.
 
-    Parameters
-    ----------
-    planes : mapping of str to Plane
-        In `box`; normals may point either way. Surfaces end at their intersections.
-    points : array, shape (N, 3)
-        All corners of all markers, in `box`. On its open sides the box ends just beyond the
-        outermost of them, along the axes of `box`.
-
-    Raises
-    ------
-    CalibrationError
-        If there are fewer than two planes, or markers on both sides of one.
+    Planes and points are in `box`. Normals may point either way; surfaces end at their
+    intersections. `points` (N, 3) are all corners of all markers: on its open sides the box ends
+    just beyond the outermost of them, along the axes of `box`. Raises `CalibrationError` if there
+    are fewer than two planes, or markers on both sides of one.
     """
     if len(planes) < 2:
         raise CalibrationError(
@@ -212,21 +194,8 @@ def place_stripes(
 ) -> PlacedStripes:
     """Find the surface and place of every stripe point (paper, Eq. 34).
 
-    Parameters
-    ----------
-    camera : Camera
-        Looking into the medium of the picture.
-    stripes : StripePoints
-        Of the picture.
-    dome_from_target : SE3
-        Pose of the target in it.
-    surfaces : TargetSurfaces
-        Of the target.
-
-    Returns
-    -------
-    PlacedStripes
-        Only points that lie on a surface and not near its edge to another.
+    The camera looks into the medium of the picture. Only points that lie on a surface of the target
+    and not near its edge to another are returned.
     """
     rays = camera.rays(stripes.pixels)
     target_from_dome = dome_from_target.inverse()
@@ -249,6 +218,9 @@ def place_stripes(
 def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArray) -> FloatArray:
     """Return the moves (N, 3, K) of points on surfaces that cause given changes.
 
+    The inverse of the projection within the surface: three equations for a point's three
+    coordinates, two of them the pixel's.
+
     Parameters
     ----------
     by_point : array, shape (N, 2, 3)
@@ -257,11 +229,6 @@ def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArra
         Of the surfaces, in `dome`.
     right : array, shape (N, 3, K) or (3, K)
         Changes of the pixel's x and y, and of the distance along the normal.
-
-    Notes
-    -----
-    The inverse of the projection within the surface: three equations for a point's three
-    coordinates, two of them the pixel's.
     """
     system = np.concatenate([by_point, normals[:, None, :]], axis=1)
     finite = np.all(np.isfinite(system), axis=(1, 2))
@@ -279,34 +246,18 @@ BIN_PX = 12.0
 
 @dataclass(frozen=True, slots=True)
 class StripeGroup:
-    """B bins of points of one laser in one view, along each surface in turn.
+    """B bins of points of one laser in one view, along each surface in turn."""
 
-    Attributes
-    ----------
-    view, laser : int
-    Their indices.
-    pixels : array, shape (B, 2)
-        Means of the points' centres, weighted by their noise, in `image`.
-    across : array, shape (B, 2)
-        As `StripePoints`.
-    surface : int array, shape (B,)
-        Index into `TargetSurfaces`.
-    sigma_px : array, shape (B,)
-        Nominal noise across the stripe.
-    counts : int array, shape (B,)
-        Number of points in every bin.
-    gain : array, shape (B,)
-        Derivative of the distance from the sheet by the pixel across the stripe, metres per pixel;
-        taken at the start and held, so that residuals stay plain squares.
-    """
-
-    view: int
-    laser: int
+    view: int  # Index of the view.
+    laser: int  # Index of the laser.
+    # Shape (B, 2): means of the points' centres, weighted by their noise, in `image`.
     pixels: FloatArray
-    across: FloatArray
-    surface: IntArray
-    sigma_px: FloatArray
-    counts: IntArray
+    across: FloatArray  # Shape (B, 2): as `StripePoints`.
+    surface: IntArray  # Shape (B,): index into `TargetSurfaces`.
+    sigma_px: FloatArray  # Shape (B,): nominal noise across the stripe.
+    counts: IntArray  # Shape (B,): number of points in every bin.
+    # Shape (B,): derivative of the distance from the sheet by the pixel across the stripe, metres
+    # per pixel; taken at the start and held, so that residuals stay plain squares.
     gain: FloatArray
 
     def __len__(self) -> int:
@@ -315,24 +266,8 @@ class StripeGroup:
 
 
 def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -> StripeGroup:
-    """Put the points of one stripe into bins along it.
+    """Put the points of one stripe, on surfaces (N,), into bins along it, with a gain of 1.
 
-    Parameters
-    ----------
-    i_view, i_laser : int
-        Indices of view and laser.
-    points : StripePoints
-        Of that laser alone, N of them.
-    surface : int array, shape (N,)
-        Index of each point's surface.
-
-    Returns
-    -------
-    StripeGroup
-        With a gain of 1.
-
-    Notes
-    -----
     Within a bin a stripe is straight to a hundredth of a pixel, so that means of pixels can
     replace means of residuals.
     """
@@ -393,16 +328,8 @@ def points_on(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points where pixels meet their surfaces, and the normals there, (N, 3) each.
 
-    Parameters
-    ----------
-    camera : Camera
-        Looking into the medium of the picture.
-    pixels : array, shape (N, 2)
-        Of the picture.
-    surface : int array, shape (N,)
-        Index into `planes`.
-    planes : sequence of Plane
-        The target's surfaces in `dome`; their normals may have any length.
+    The camera looks into the medium of the picture. `surface` (N,) has indices into `planes`, the
+    target's surfaces in `dome`, whose normals may have any length.
     """
     rays = camera.rays(pixels)
     normals = np.stack([plane.normal for plane in planes])[surface]
@@ -438,15 +365,9 @@ def with_shared_error(group: StripeGroup, error_px: float) -> StripeGroup:
 def correlation_factor(sequences: Sequence[FloatArray]) -> float:
     """Return the ratio of the variance of a mean to that for independent values.
 
-    Parameters
-    ----------
-    sequences : sequence of array, shape (B,)
-        Residuals in order along stripes; NaN for missing ones.
-
-    Notes
-    -----
     One plus twice the sum of autocorrelations, up to the first that is not positive (Geyer 1992,
-    doi:10.1214/ss/1177011137, initial positive sequence). At least 1.
+    doi:10.1214/ss/1177011137, initial positive sequence). At least 1. Each sequence (B,) has
+    residuals in order along a stripe; NaN for missing ones.
     """
     # Greatest lag of the autocorrelation, in bins, and least number of pairs at each lag.
     max_lag, min_pairs = 12, 20

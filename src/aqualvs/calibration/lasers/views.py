@@ -42,21 +42,10 @@ class SpatialPose:
 
 
 def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
-    """Minimise the paper's V (Eq. 32-33).
+    """Minimise the paper's V (Eq. 32-33) from a `dome_from_target` near the solution.
 
-    Parameters
-    ----------
-    camera : Camera
-        Looking into the medium of the picture.
-    view : View
-        Inlier corners; this cost is not robust.
-    start : SE3
-        `dome_from_target` near the solution.
-
-    Raises
-    ------
-    CalibrationError
-        If fewer than three corners have rays (the paper's minimum).
+    The view has inlier corners alone: this cost is not robust. Raises `CalibrationError` if fewer
+    than three corners have rays (the paper's minimum).
     """
     rays = camera.rays(view.pixels)
     n = int(np.count_nonzero(rays.valid))
@@ -120,25 +109,9 @@ def place_views(
 ) -> tuple[list[PlacedView], dict[str, str]]:
     """Find the pose of every picture, and its stripes on the surfaces.
 
-    Parameters
-    ----------
-    camera : Camera
-        Looking into the medium of the pictures.
-    views : sequence of LaserView
-        One for each picture.
-    surfaces : TargetSurfaces
-        Of the target. If it has several, markers must be seen on at least two.
-
-    Returns
-    -------
-    placed : list of PlacedView
-    left_out : dict
-        Names of the pictures that could not be used, with the reason.
-
-    Raises
-    ------
-    CalibrationError
-        If no picture can be used.
+    The camera looks into the medium of the pictures. If the target has several surfaces, markers
+    must be seen on at least two. Returned, too, are the names of the pictures that could not be
+    used, with the reason. Raises `CalibrationError` if no picture can be used.
     """
     found: list[PlacedView] = []
     left_out: dict[str, str] = {}
@@ -150,9 +123,8 @@ def place_views(
             left_out[name] = str(fault).removeprefix(f"{name}: ")
     if not found:
         few = f" (and {len(left_out) - 1} more likewise)" if len(left_out) > 1 else ""
-        reason = next(
-            (f"{name}: {why}" for name, why in left_out.items()), "no pictures were given"
-        )
+        reasons = [f"{name}: {why}" for name, why in left_out.items()]
+        reason = reasons[0] if reasons else "no pictures were given"
         raise CalibrationError(f"no picture can be used: {reason}{few}")
     return found, left_out
 
@@ -168,7 +140,13 @@ def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces
     pose = target_pose(camera, view)
     believed = view.where(pose.inliers)
     if len(surfaces.planes) > 1:
-        _check_surfaces(believed, surfaces)
+        seen = planes_with_points(believed, surfaces.planes)
+        if len(seen) < 2:
+            where = f"plane '{surfaces.names[seen[0]]}' only" if seen else "none of the planes"
+            raise CalibrationError(
+                f"{view.name}: markers are seen on {where}; turn the vehicle so that markers on "
+                "two planes of the box are in the picture"
+            )
     elif pose.ambiguous:
         raise CalibrationError(
             f"{view.name}: the board could lean either way; take this picture from nearer, or "
@@ -192,16 +170,6 @@ def replaced(camera: Camera, view: PlacedView, pose: SE3, surfaces: TargetSurfac
     """Return the picture with another pose, and its stripes placed by that pose."""
     placed = place_stripes(camera, view.stripes, pose, surfaces)
     return replace(view, dome_from_target=pose, placed=placed)
-
-
-def _check_surfaces(view: View, surfaces: TargetSurfaces) -> None:
-    seen = planes_with_points(view, surfaces.planes)
-    if len(seen) < 2:
-        where = f"plane '{surfaces.names[seen[0]]}' only" if seen else "none of the planes"
-        raise CalibrationError(
-            f"{view.name}: markers are seen on {where}; turn the vehicle so that markers on two "
-            "planes of the box are in the picture"
-        )
 
 
 def pooled(views: Sequence[PlacedView], surfaces: TargetSurfaces) -> PooledStripes:

@@ -46,9 +46,7 @@ class KnownDistance:
         by_turn = np.array([ny * z - nz * y, nz * x - nx * z, nx * y - ny * x])
         jacobian = np.concatenate([by_turn, normal]) / (normal[1] * self.sigma)
         residual = np.array([[(found - self.distance) / self.sigma]])
-        return [
-            Block(DISTANCES, columns, residual, jacobian[None, None, :], RobustLoss.HUBER, False)
-        ]
+        return [Block(DISTANCES, columns, residual, jacobian[None, None, :], scaled=False)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,31 +64,16 @@ class SquareBoard:
         """Return the tilt of the board (about x and z), and its roll (about y)."""
         del centre
         off_square = dome_from_target.rotation @ self.square.T
-        tilt = tilt_of(off_square)
+        # The axis of the rotation times the sine of its angle.
+        r = off_square
+        tilt = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
         by_turn = 0.5 * (np.trace(off_square) * np.eye(3) - off_square)
-        return [
-            Block(
-                group,
-                columns[:3],
-                tilt[None, axes] / sigma,
-                by_turn[None, axes, :] / sigma,
-                RobustLoss.CAUCHY,
-                False,
-            )
-            for group, axes, sigma in (
-                (TILTS, [0, 2], self.board_tilt_sigma),
-                (ROLLS, [1], self.roll_sigma),
-            )
-        ]
 
+        def block(group: str, axes: list[int], sigma: float) -> Block:
+            off, slopes = tilt[None, axes] / sigma, by_turn[None, axes, :] / sigma
+            return Block(group, columns[:3], off, slopes, RobustLoss.CAUCHY, scaled=False)
 
-def tilt_of(off_square: FloatArray) -> FloatArray:
-    """Return the axis of a rotation (..., 3, 3) times the sine of its angle, shape (..., 3)."""
-    r = off_square
-    return 0.5 * np.stack(
-        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
-        axis=-1,
-    )
+        return [block(TILTS, [0, 2], self.board_tilt_sigma), block(ROLLS, [1], self.roll_sigma)]
 
 
 def plane_distance(dome_from_target: SE3) -> float:
@@ -105,59 +88,12 @@ PRIORS = "priors"
 _ROTATION = POSE_PARAMETERS[3:]
 
 
-def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty) -> list[Block]:
-    """Return the deviation of a rig from its prior, in sigmas.
-
-    Parameters
-    ----------
-    start, rig : Rig
-        Mean of the prior, and the present rig.
-    free : sequence of str
-        Numbers of the columns 0, 1, ... of the solve.
-    priors : RigUncertainty
-        Uncertainty of `start`; numbers that it does not name have no prior.
-    """
-    known = [name for name in free if name in priors.names]
-    if not known:
-        return []
-    columns = np.array([free.index(name) for name in known])
-    return [_prior(columns, rig_difference(start, rig, known), _whiten(priors.of(known)))]
-
-
-def media_prior(
-    start: FloatArray, media: FloatArray, sigma: FloatArray, columns: IntArray
-) -> list[Block]:
-    """Return the deviation of media from their priors, in sigmas.
-
-    Parameters
-    ----------
-    start, media : array, shape (M,)
-        Indices of the free media: prior means, and present values.
-    sigma : array, shape (M,)
-        Standard deviations of the prior; infinite where there is none.
-    columns : int array, shape (M,)
-        Of the media in the solve.
-    """
-    bounded = np.isfinite(sigma)
-    if not bounded.any():
-        return []
-    moved = (media - start)[bounded]
-    return [_prior(columns[bounded], moved, np.diag(1.0 / sigma[bounded]))]
-
-
 def rig_difference(start: Rig, rig: Rig, names: Sequence[str]) -> FloatArray:
     """Return the step (P,) of `rig_moved_by` that leads from `start` to `rig`, by named numbers."""
     a, b = rig_numbers(start), rig_numbers(rig)
     turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ start.dome_from_cam.rotation.T)
     rotation = dict(zip(_ROTATION, turn, strict=True))
     return np.array([rotation[n] if n in rotation else b[n] - a[n] for n in names])
-
-
-def _whiten(covariance: FloatArray) -> FloatArray:
-    """Return W with W.T @ W the inverse of a covariance, whatever its units."""
-    sigma = np.sqrt(np.diag(covariance))
-    lower = np.linalg.cholesky(covariance / np.outer(sigma, sigma))
-    return np.linalg.inv(lower) / sigma
 
 
 def _prior(columns: IntArray, moved: FloatArray, whiten: FloatArray) -> Block:
@@ -168,13 +104,8 @@ def _prior(columns: IntArray, moved: FloatArray, whiten: FloatArray) -> Block:
 def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
     """Return `dome_from_target` turned about a point of the target, then shifted.
 
-    Parameters
-    ----------
-    pose : SE3
-    middle : array, shape (3,)
-        Centre of the turn, in the target's frame.
-    step : array, shape (6,)
-        Rotation vector (radians) and shift (metres), both in `dome`.
+    `middle` (3,) is that point in the target's frame; `step` (6,) has a rotation vector (radians)
+    and a shift (metres), both in `dome`.
     """
     turn, arm = rotation_from_rotvec(step[:3]), pose.rotation @ middle
     # The middle lies at arm + translation, and stays there under the turn.
@@ -182,14 +113,9 @@ def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
 
 
 def point_by_pose(points_in_dome: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the derivative (N, 3, 6) of points by the step of `moved_target` at zero.
+    """Return the derivative (N, 3, 6) of points (N, 3) by the step of `moved_target` at zero.
 
-    Parameters
-    ----------
-    points_in_dome : array, shape (N, 3)
-        Points of the target.
-    centre : array, shape (3,)
-        Centre of the turn, in `dome`.
+    `centre` (3,): of the turn, in `dome`.
     """
     by_pose = np.zeros((len(points_in_dome), 3, 6))
     by_pose[:, :, :3] = -skew(points_in_dome - centre)
@@ -353,10 +279,21 @@ class Bundle:
         ]
 
     def _priors(self, state: BundleState) -> list[Block]:
-        media, free = self.free_media, self.free
-        return rig_prior(self.start.rig, state.rig, free, self.priors) + media_prior(
-            self.start.media[media],
-            state.media[media],
-            self.media_sigma[media],
-            np.arange(len(free), self.n_shared),
-        )
+        """Return the deviations of the rig and of media from their priors, in sigmas."""
+        blocks = []
+        known = [name for name in self.free if name in self.priors.names]
+        if known:
+            columns = np.array([self.free.index(name) for name in known])
+            covariance = self.priors.of(known)
+            sigma = np.sqrt(np.diag(covariance))
+            # whiten.T @ whiten is the inverse of the covariance, whatever its units.
+            lower = np.linalg.cholesky(covariance / np.outer(sigma, sigma))
+            whiten = np.linalg.inv(lower) / sigma
+            moved = rig_difference(self.start.rig, state.rig, known)
+            blocks.append(_prior(columns, moved, whiten))
+        bounded = [i for i in self.free_media if np.isfinite(self.media_sigma[i])]
+        if bounded:
+            columns = np.concatenate([self.medium_columns(i) for i in bounded])
+            moved = state.media[bounded] - self.start.media[bounded]
+            blocks.append(_prior(columns, moved, np.diag(1.0 / self.media_sigma[bounded])))
+        return blocks

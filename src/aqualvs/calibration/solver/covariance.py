@@ -143,15 +143,9 @@ def observability(
 ) -> Observability:
     """Compare the information that a solve adds about some numbers with their priors.
 
-    All else is marginalised, with its priors: poses, the lens, the intrinsics.
-
-    Parameters
-    ----------
-    uncertainty : RigUncertainty
-        After the solve, with the uncertainty of considered numbers propagated.
-    names : sequence of str
-        Numbers to judge, with priors independent of those of others; those without a prior are
-        skipped.
+    All else is marginalised, with its priors: poses, the lens, the intrinsics. `uncertainty` is
+    that after the solve, with considered numbers propagated. Priors of `names` are independent of
+    those of others; names without a prior are skipped.
     """
     names = [name for name in names if name in bundle.free and name in bundle.priors.names]
     if not names:
@@ -161,7 +155,10 @@ def observability(
     learnt = solution.information.copy()
     learnt[np.ix_(columns, columns)] -= np.linalg.inv(prior)
     root = np.linalg.cholesky(prior)
-    gains, vectors = np.linalg.eigh(root.T @ _marginal(learnt, columns) @ root)
+    others = np.setdiff1d(np.arange(len(learnt)), columns)
+    cross, own = learnt[np.ix_(columns, others)], learnt[np.ix_(columns, columns)]
+    marginal = own - cross @ inverse(learnt[np.ix_(others, others)]) @ cross.T
+    gains, vectors = np.linalg.eigh(root.T @ marginal @ root)
     # In the numbers themselves a direction is root @ vector; given in sigmas of each one's prior.
     shares = root @ vectors / np.sqrt(np.diag(prior))[:, None]
     shares /= np.linalg.norm(shares, axis=0)
@@ -173,37 +170,26 @@ def observability(
     return Observability({name: after[name] / before[name] for name in names}, directions)
 
 
-def _marginal(information: FloatArray, columns: IntArray) -> FloatArray:
-    """Return the information on some parameters once all others are marginalised."""
-    others = np.setdiff1d(np.arange(len(information)), columns)
-    cross = information[np.ix_(columns, others)]
-    own = information[np.ix_(columns, columns)]
-    return own - cross @ inverse(information[np.ix_(others, others)]) @ cross.T
-
-
 def consider_covariance(
     bundle: Bundle, solution: Solution[BundleState], considered: RigUncertainty
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Return the joint covariance of solved and considered numbers.
+    """Return the joint covariance of solved and considered numbers, and the rig's names in it.
 
-    Parameters
-    ----------
-    bundle : Bundle
-        The problem.
-    considered : RigUncertainty
-        Of numbers that the bundle does not solve for.
-
-    Returns
-    -------
-    names : tuple of str
-        `bundle.free`, then those of `considered`.
-    covariance : array, shape (P + H, P + H)
-        In the bundle's columns, then those of `considered`.
+    Rows are the bundle's columns (P), then those of `considered`, which the bundle does not solve
+    for.
     """
     if not considered.names:
         return bundle.free, solution.covariance.copy()
-    cross = _cross_information(bundle, solution, considered.names)
-    gain = -solution.covariance @ cross
+    wider = replace(bundle, free=(*bundle.free, *considered.names))
+    kept = [i for i, b in enumerate(solution.blocks) if b.group != PRIORS]
+    # Priors stand at the end, so both problems begin with the same blocks.
+    blocks = wider.blocks(solution.state)[: len(kept)]
+    inliers = [solution.inliers[i] for i in kept]
+    scales = [solution.block_scales[i] for i in kept]
+    information = normal_equations(wider.n_parameters, blocks, inliers, scales).information
+    n, m = len(bundle.free), len(considered.names)
+    solved = np.r_[0:n, n + m : wider.n_parameters]
+    gain = -solution.covariance @ information[np.ix_(solved, np.arange(n, n + m))]
     passed_on = gain @ considered.covariance
     joint = np.block(
         [
@@ -212,26 +198,6 @@ def consider_covariance(
         ]
     )
     return (*bundle.free, *considered.names), joint
-
-
-def _cross_information(
-    bundle: Bundle, solution: Solution[BundleState], considered: tuple[str, ...]
-) -> FloatArray:
-    """Return the cross information of the data on solved and considered numbers, shape (P, H)."""
-    wider = replace(bundle, free=(*bundle.free, *considered))
-    kept = [i for i, b in enumerate(solution.blocks) if b.group != PRIORS]
-    # Priors stand at the end, so both problems begin with the same blocks.
-    blocks = wider.blocks(solution.state)[: len(kept)]
-    information = normal_equations(
-        wider.n_parameters,
-        blocks,
-        [solution.inliers[i] for i in kept],
-        [solution.block_scales[i] for i in kept],
-    ).information
-    n, m = len(bundle.free), len(considered)
-    solved = np.r_[0:n, n + m : wider.n_parameters]
-    cross: FloatArray = information[np.ix_(solved, np.arange(n, n + m))]
-    return cross
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,12 +218,8 @@ class ViewCovariance:
 def shared_covariance(bundle: Bundle, solution: Solution[BundleState]) -> ViewCovariance:
     """Estimate the covariance of the parameters that a bundle's views share, by `view_covariance`.
 
-    Parameters
-    ----------
-    bundle : Bundle
-        Without priors, and with free poses that have none either.
-    solution : Solution
-        Of it; columns beyond those of the bundle are shared, too, and come last.
+    Neither bundle nor poses have priors, and all poses are free. Columns of the solution beyond
+    those of the bundle are shared, too, and come last.
     """
     n = len(bundle.views)
     beyond = np.arange(bundle.n_parameters, len(solution.covariance))
@@ -272,28 +234,13 @@ def view_covariance(
 ) -> ViewCovariance:
     """Estimate the covariance of shared parameters from views with a pose each.
 
-    Parameters
-    ----------
-    blocks : sequence of Block
-        One for each view, at the solution or near it. Columns that are not shared
-        belong to its pose alone.
-    inliers : sequence of bool array, shape (N,)
-        Inlier corners.
-    scales : sequence of float
-        Noise of each view as a multiple of the nominal one.
-    shared : int array, shape (S,)
-        Columns of the parameters that all views share.
-
-    Raises
-    ------
-    CalibrationError
-        If the views give no information on one of the parameters.
+    There is one block, one mask of inlier corners and one noise scale for each view, at the
+    solution or near it. `shared` (S,) are the columns that all views share; a block's other columns
+    belong to its pose alone. Raises `CalibrationError` if the views give no information on one of
+    the parameters.
     """
-    own, pulls = [], []
-    for block, inside, scale in zip(blocks, inliers, scales, strict=True):
-        information, pull = _without_pose(block, inside, scale, shared)
-        own.append(information)
-        pulls.append(pull)
+    each = zip(blocks, inliers, scales, strict=True)
+    own, pulls = zip(*(_without_pose(*one, shared) for one in each), strict=True)
     by_corners = inverse(np.sum(own, axis=0))
     root = _root(by_corners)
     white = [root.T @ information @ root for information in own]
@@ -332,12 +279,8 @@ def _root(covariance: FloatArray) -> FloatArray:
 def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[FloatArray, float]:
     """Return the covariance (S, S) of the parameters in units of that by corners, and its mean.
 
-    Parameters
-    ----------
-    own : sequence of array, shape (S, S)
-        Information of each view; they add up to the unit matrix.
-    scores : sequence of array, shape (S,)
-        Its score; of covariance own (1 - own) if the errors of corners are independent.
+    `own`, each (S, S): information of each view; they add up to the unit matrix. `scores`, each
+    (S,): of covariance own (1 - own) if the errors of corners are independent.
     """
     n, size = len(own), len(own[0])
     corrected, expected = np.zeros((n, size)), 0.0

@@ -79,11 +79,11 @@ def target_pose(
     Parameters
     ----------
     camera : Camera
-        Bare or behind a dome, looking into the medium of the picture.
+        Looks into the medium of the picture.
     view : View
         At least four points that are not on one line; up to about a third may be wrong.
     start : SE3, optional
-        Pose to begin from, where it is known roughly: no other is tried unless it fails.
+        A roughly known pose: no other is tried unless it fails.
     max_rms_px : float
         Largest residual of the inliers of a view of this target. Infinite accepts any pose.
 
@@ -103,7 +103,11 @@ def target_pose(
             if again is not None and (best is None or _better(again, best)):
                 best, rival = again, second
     if best is None or _rms_px(best) > max_rms_px or _believed(best) < _POSE.min_points:
-        raise CalibrationError(_not_found(view, best))
+        fit = "" if best is None else f" (the best leaves {_rms_px(best):.1f} px)"
+        raise CalibrationError(
+            f"{view.name}: no pose of the target explains its {len(view)} points{fit}; check the "
+            "target's file against the print, and the rig and medium against the picture"
+        )
     return _result(best, rival)
 
 
@@ -122,14 +126,9 @@ class _PoseProblem:
         points = state.apply(self.view.points)
         pixels, _, by_point = self.camera.project_with_jacobian(points)
         middle = state.apply(self.view.middle)
-        return [
-            Block(
-                CORNERS,
-                np.arange(6),
-                (pixels - self.view.pixels) / CORNER_SIGMA_PX,
-                by_point @ point_by_pose(points, middle) / CORNER_SIGMA_PX,
-            )
-        ]
+        residuals = (pixels - self.view.pixels) / CORNER_SIGMA_PX
+        by_pose = by_point @ point_by_pose(points, middle) / CORNER_SIGMA_PX
+        return [Block(CORNERS, np.arange(6), residuals, by_pose)]
 
     def moved(self, state: SE3, step: FloatArray) -> SE3:
         return moved_target(state, self.view.middle, step)
@@ -294,24 +293,8 @@ def _result(best: Solution[SE3], rival: Solution[SE3] | None) -> TargetPose:
     tempered = (freedom * scale**2 + prior_freedom) / (freedom + prior_freedom)
     rms = _rms_px(best)
     ambiguous = rival is not None and _rms_px(rival) < _POSE.rival * rms + 0.1 * CORNER_SIGMA_PX
-    return TargetPose(
-        dome_from_target=best.state,
-        covariance=best.covariance * (tempered / scale**2),
-        rms_px=rms,
-        inliers=best.inliers[0],
-        ambiguous=ambiguous,
-    )
-
-
-def _not_found(view: View, best: Solution[SE3] | None) -> str:
-    fit = "" if best is None else f" (the best leaves {_rms_px(best):.1f} px)"
-    return (
-        f"{view.name}: no pose of the target explains its {len(view)} points{fit}; check the "
-        "target's file against the print, and the rig and medium against the picture"
-    )
-
-
-_QUARTER = 0.5 * np.pi
+    covariance = best.covariance * (tempered / scale**2)
+    return TargetPose(best.state, covariance, rms, best.inliers[0], ambiguous)
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,15 +339,14 @@ def thinned(view: View) -> View:
 
 
 def square_rotation(rotations: Sequence[FloatArray]) -> FloatArray:
-    """Return the nearest `dome_from_board` rotation of boards square to the dome.
+    """Return the nearest `dome_from_board` rotation (3, 3) of boards square to the dome.
 
     Boards stand upright, on a side or upside down: x and y along the dome's x and -z axes, or a
-    quarter turn about y further.
-
-    `rotations`, each of shape (3, 3): of the boards; the majority decides.
+    quarter turn about y further. The majority of the rotations decides.
     """
+    quarter = 0.5 * np.pi
     choices = [
-        rotation_from_rotvec([0.0, k * _QUARTER, 0.0]) @ DOME_FROM_CAM_NOMINAL for k in range(4)
+        rotation_from_rotvec([0.0, k * quarter, 0.0]) @ DOME_FROM_CAM_NOMINAL for k in range(4)
     ]
     nearness = [np.median([np.trace(r @ choice.T) for r in rotations]) for choice in choices]
     return choices[int(np.argmax(nearness))]
@@ -378,14 +360,8 @@ def turned_square(
     The pictures do not determine this turn: through a sphere it changes nothing. The turn chosen
     makes one of the boards exactly square and leaves the smallest robust tilt of the others.
 
-    Parameters
-    ----------
-    square : array, shape (3, 3)
-        Rotation of a square board.
-    boards : sequence of int
-        Indices of boards most of which are known to be square.
-    sigma : float
-        Standard deviation of their tilt, in radians.
+    `square` (3, 3) is the rotation of a square board, `boards` are the indices of those most of
+    which are square, `sigma` is the standard deviation of their tilt, in radians.
     """
     tilts = np.array([rotvec_from_rotation(poses[i].rotation @ square.T) for i in boards])
     apart = np.sum((tilts[:, None] - tilts[None]) ** 2, axis=-1)

@@ -8,6 +8,7 @@ The noise of each block (`Block`) is estimated from its residuals, shrunk toward
 group; the covariance follows from that estimate, not from the nominal noise.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -109,24 +110,19 @@ def normal_equations(
     information, gradient = np.zeros((n_parameters, n_parameters)), np.zeros(n_parameters)
     own = []
     for block, inside, scale in zip(blocks, inliers, scales, strict=True):
-        matrix, vector = _of_block(block, inside, scale)
-        information[block.columns[:, None], block.columns] += matrix
-        gradient[block.columns] += vector
-        own.append(matrix)
+        weights = block.loss.weight(block.lengths / scale)
+        # A point that a step made invisible has no derivative.
+        believed = inside & np.isfinite(weights)
+        residuals, jacobian = block.residuals, block.jacobian
+        if not believed.all():
+            weights, residuals = weights[believed], residuals[believed]
+            jacobian = jacobian[believed]
+        root = np.repeat(np.sqrt(weights) / scale, residuals.shape[1])
+        slopes = jacobian.reshape(-1, len(block.columns)) * root[:, None]
+        own.append(slopes.T @ slopes)
+        information[block.columns[:, None], block.columns] += own[-1]
+        gradient[block.columns] += slopes.T @ (residuals.reshape(-1) * root)
     return NormalEquations(information, gradient, tuple(own))
-
-
-def _of_block(block: Block, inside: BoolArray, scale: float) -> tuple[FloatArray, FloatArray]:
-    n_values, n_columns = block.residuals.shape[1], len(block.columns)
-    weights = block.loss.weight(block.lengths / scale)
-    # A point that a step made invisible has no derivative.
-    believed = inside & np.isfinite(weights)
-    residuals, jacobian = block.residuals, block.jacobian
-    if not believed.all():
-        weights, residuals, jacobian = weights[believed], residuals[believed], jacobian[believed]
-    root = np.repeat(np.sqrt(weights) / scale, n_values)
-    slopes = jacobian.reshape(-1, n_columns) * root[:, None]
-    return slopes.T @ slopes, slopes.T @ (residuals.reshape(-1) * root)
 
 
 def cost(
@@ -152,35 +148,10 @@ _TINY = 1e-6
 _MIN_FREEDOM = 0.5
 
 
-def start_scales(blocks: Sequence[Block]) -> list[float]:
-    """Return a first noise scale for every block: its group's median, robust to outliers.
-
-    Blocks that are not scaled have 1.
-    """
-    groups = {b.group for b in blocks if b.scaled}
-    scale = {g: _median_scale([b for b in blocks if b.scaled and b.group == g]) for g in groups}
-    return [scale[b.group] if b.scaled else 1.0 for b in blocks]
-
-
-def freedoms(
-    blocks: Sequence[Block],
-    inliers: Sequence[BoolArray],
-    equations: NormalEquations,
-    covariance: FloatArray,
-) -> list[float]:
-    """Return the residual degrees of freedom of every block."""
-    triples = zip(blocks, inliers, equations.own, strict=True)
-    return [
-        block.values(inside)
-        - float(np.sum(own * covariance[block.columns[:, None], block.columns]))
-        for block, inside, own in triples
-    ]
-
-
-def believed(
+def _believed(
     blocks: Sequence[Block], scales: Sequence[float], largest: Sequence[float]
 ) -> list[BoolArray]:
-    """Return the inliers of every block; `largest` as from `largest_scales`."""
+    """Return the inliers of every block."""
     # Residuals longer than this, in scales, are outliers: 4e-6 of good corners.
     reject = 5.0
     return [
@@ -190,7 +161,7 @@ def believed(
     ]
 
 
-def group_scales(
+def _group_scales(
     blocks: Sequence[Block],
     inliers: Sequence[BoolArray],
     scales: Sequence[float],
@@ -199,8 +170,7 @@ def group_scales(
 ) -> dict[str, float]:
     """Return the typical scale of every group: the median of its blocks' own scales.
 
-    Blocks are weighted by their degrees of freedom. A few bad ones do not count. `largest` as from
-    `largest_scales`.
+    Blocks are weighted by their degrees of freedom. A few bad ones do not count.
     """
     typical = {}
     for group in {b.group for b in blocks if b.scaled}:
@@ -217,7 +187,7 @@ def group_scales(
     return typical
 
 
-def block_scales(
+def _block_scales(
     blocks: Sequence[Block],
     inliers: Sequence[BoolArray],
     scales: Sequence[float],
@@ -225,10 +195,7 @@ def block_scales(
     largest: Sequence[float],
     typical: dict[str, float],
 ) -> list[float]:
-    """Return the scale of every block: from its own residuals, shrunk towards its group's.
-
-    `largest` as from `largest_scales`.
-    """
+    """Return the scale of every block: from its own residuals, shrunk towards its group's."""
     found = []
     # Weight of the group's noise in that of a block, as a number of values.
     group_freedom = 10.0
@@ -244,19 +211,14 @@ def block_scales(
     return found
 
 
-def largest_scales(blocks: Sequence[Block], freedom: Sequence[float]) -> list[float]:
-    """Return the upper limit of every block's scale from the median of its residuals.
+def _largest_scale(block: Block, freedom: float) -> float:
+    """Return the upper limit of a block's scale from the median of its residuals.
 
     Many outliers would raise the scale that accepts them; the limit prevents that. Blocks that are
     not scaled have none.
     """
-    pairs = zip(blocks, freedom, strict=True)
-    return [_largest_scale(block, free) if block.scaled else float("inf") for block, free in pairs]
-
-
-def _largest_scale(block: Block, freedom: float) -> float:
     values = block.values(block.seen)
-    if freedom <= _MIN_FREEDOM or not values:
+    if not block.scaled or freedom <= _MIN_FREEDOM or not values:
         return float("inf")
     # Factor by which the median's scale may be too small by chance.
     doubt = 1.5
@@ -357,17 +319,9 @@ def solve(
 ) -> Solution[State]:
     """Minimise the residuals of a problem, without observations beyond five scales.
 
-    Parameters
-    ----------
-    start : State
-        Initial guess, near enough to the solution for Newton's method.
-    remedy : callable, optional
-        Gives the message, with the remedy, for a parameter that is not determined.
-
-    Raises
-    ------
-    CalibrationError
-        If a parameter is not determined, or nothing can be seen from the start.
+    `start` is near enough to the solution for Newton's method; `remedy` gives the message, with
+    the remedy, for a parameter that is not determined. Raises `CalibrationError` if there is such a
+    parameter, or nothing can be seen from the start.
     """
     max_rounds = 20
     try:
@@ -388,9 +342,8 @@ def solve(
 def inverse(information: FloatArray) -> FloatArray:
     """Invert a positive semidefinite matrix whose units differ by many orders of magnitude.
 
-    Combinations known to rounding only get a variance that is huge, but finite.
-
-    Raises `CalibrationError` if one of the parameters is not determined at all.
+    Combinations known to rounding only get a variance that is huge, but finite. Raises
+    `CalibrationError` if one of the parameters is not determined at all.
     """
     if not len(information):
         return information
@@ -424,7 +377,11 @@ class _Run(Generic[State]):
             raise CalibrationError(
                 "no point can be seen from the starting values; check the rig's lens and dome"
             )
-        self.scales = start_scales(self.blocks)
+        # The median of a group's residuals is robust to outliers.
+        scaled = [b for b in self.blocks if b.scaled]
+        groups = {b.group for b in scaled}
+        scale = {g: _median_scale([b for b in scaled if b.group == g]) for g in groups}
+        self.scales = [scale[b.group] if b.scaled else 1.0 for b in self.blocks]
 
     def descend(self, small_step: float) -> None:
         """Iterate towards the minimum at the present scales and inliers, until steps are small."""
@@ -454,12 +411,17 @@ class _Run(Generic[State]):
         """Estimate noise and outliers anew; return whether that moves the minimum."""
         before = self.scales, self.inliers
         equations = self._equations()
-        freedom = freedoms(self.blocks, self.inliers, equations, inverse(equations.information))
-        largest = largest_scales(self.blocks, freedom)
-        self.inliers = believed(self.blocks, self.scales, largest)
+        covariance = inverse(equations.information)
+        # Residual degrees of freedom of every block.
+        freedom = [
+            b.values(inside) - float(np.sum(own * covariance[b.columns[:, None], b.columns]))
+            for b, inside, own in zip(self.blocks, self.inliers, equations.own, strict=True)
+        ]
+        largest = [_largest_scale(*pair) for pair in zip(self.blocks, freedom, strict=True)]
+        self.inliers = _believed(self.blocks, self.scales, largest)
         now = self.blocks, self.inliers, self.scales, freedom, largest
-        self.typical = group_scales(*now)
-        self.scales = block_scales(*now, self.typical)
+        self.typical = _group_scales(*now)
+        self.scales = _block_scales(*now, self.typical)
         same = all(np.array_equal(a, b) for a, b in zip(before[1], self.inliers, strict=True))
         # Relative change of a noise scale that does not affect the solution.
         same_scale = 5e-3
@@ -483,7 +445,8 @@ class _Run(Generic[State]):
     def _damped_step(self, equations: NormalEquations) -> FloatArray:
         diagonal = np.diag(equations.information)
         damped = equations.information + np.diag(self.damping * diagonal)
-        return _solve(damped, -equations.gradient)
+        size = _sizes(damped)
+        return np.linalg.solve(damped / np.outer(size, size), -equations.gradient / size) / size
 
     def _lower(self, equations: NormalEquations, step: FloatArray, here: float) -> float | None:
         """Take the step, or a shorter one that does not raise the cost; return the cost there.
@@ -492,22 +455,18 @@ class _Run(Generic[State]):
         """
         while self.damping < _DESCENT.damping_limit:
             self.n_iterations += 1
-            trial = self._try(step)
-            if trial is not None and trial[2] <= here:
-                self.state, self.blocks, there = trial
-                self.damping = max(self.damping * 0.1, _DESCENT.damping_least)
-                return there
+            # A step may lead to what cannot exist.
+            with contextlib.suppress(RigError):
+                state = self.problem.moved(self.state, step)
+                blocks = tuple(self.problem.blocks(state))
+                there = self._cost(blocks)
+                if there <= here:
+                    self.state, self.blocks = state, blocks
+                    self.damping = max(self.damping * 0.1, _DESCENT.damping_least)
+                    return there
             self.damping *= 10.0
             step = self._damped_step(equations)
         return None
-
-    def _try(self, step: FloatArray) -> tuple[State, tuple[Block, ...], float] | None:
-        try:
-            state = self.problem.moved(self.state, step)
-            blocks = tuple(self.problem.blocks(state))
-        except RigError:
-            return None
-        return state, blocks, self._cost(blocks)
 
     def _cost(self, blocks: Sequence[Block]) -> float:
         # Residual, in sigmas, that stands for an observation that a step makes invisible.
@@ -516,11 +475,6 @@ class _Run(Generic[State]):
 
     def _equations(self) -> NormalEquations:
         return normal_equations(self.problem.n_parameters, self.blocks, self.inliers, self.scales)
-
-
-def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    size = _sizes(matrix)
-    return np.linalg.solve(matrix / np.outer(size, size), right / size) / size
 
 
 def _sizes(information: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtr
@@ -54,8 +55,7 @@ class FittedViews:
         return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
 
 
-@dataclass(frozen=True, slots=True)
-class SolvedMedium:
+class SolvedMedium(NamedTuple):
     """Index of a medium with its uncertainty, 0 if it was taken as exact."""
 
     name: str

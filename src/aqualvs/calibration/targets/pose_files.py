@@ -99,8 +99,7 @@ def _pose(columns: list[str], row: list[str], place: str) -> BoardPose:
     distance_mm = values.get("distance_mm")
     if distance_mm is not None:
         _check_distance(distance_mm, place)
-    matrix = [values.get(key) for key in _MATRIX]
-    pose = _matrix_pose(matrix, place)
+    pose = _matrix_pose([values.get(key) for key in _MATRIX], place)
     if pose is not None and distance_mm is not None:
         _check_agreement(pose, distance_mm, place)
     return BoardPose(name, None if distance_mm is None else distance_mm / _MM, pose)
@@ -176,7 +175,14 @@ def _check_agreement(pose: SE3, distance_mm: float, place: str) -> None:
 
 def _check_copy(copy: BoardPose, original: BoardPose, source: Path) -> None:
     """Raise `CalibrationError` if one picture was given two poses, under two names."""
-    if _numbers(copy) != _numbers(original):
+
+    def numbers(pose: BoardPose) -> tuple[float | None, bytes]:
+        place = pose.dome_from_board
+        if place is None:
+            return pose.distance, b""
+        return pose.distance, place.rotation.tobytes() + place.translation.tobytes()
+
+    if numbers(copy) != numbers(original):
         first, second = original.distance, copy.distance
         differ = "rows differ"
         if first is not None and second is not None and first != second:
@@ -185,14 +191,6 @@ def _check_copy(copy: BoardPose, original: BoardPose, source: Path) -> None:
             f"{source}: {copy.name} is a copy of the picture {original.name}, but their {differ}; "
             "take the wrong row and picture out, or put the right picture there"
         )
-
-
-def _numbers(pose: BoardPose) -> tuple[float | None, bytes]:
-    """Return what a row states, to be compared."""
-    place = pose.dome_from_board
-    if place is None:
-        return pose.distance, b""
-    return pose.distance, place.rotation.tobytes() + place.translation.tobytes()
 
 
 def match_poses(
@@ -204,19 +202,9 @@ def match_poses(
 ) -> tuple[tuple[BoardPose, ...], tuple[str, ...]]:
     """Return the pose of each picture, in the pictures' order, and remarks.
 
-    Parameters
-    ----------
-    poses : sequence of BoardPose
-        Rows of the file.
-    source : Path
-        The file, for messages.
-    copies : mapping, optional
-        Names of pictures that are left out as copies, with the names of those that they repeat.
-
-    Raises
-    ------
-    CalibrationError
-        If a picture has no row, or the rows of a picture and its copy contradict each other.
+    `poses` are the rows of the file `source`. `copies` has the names of pictures that are left out
+    as copies, with the names of those that they repeat. Raises `CalibrationError` if a picture has
+    no row, or the rows of a picture and its copy contradict each other.
     """
     copies = copies or {}
     by_name = {pose.name: pose for pose in poses}

@@ -20,7 +20,7 @@ import numpy as np
 from aqualvs.calibration.detection.tag_corners import marker_cells
 from aqualvs.calibration.targets.targets import Board, BoardKind, MarkerSet, aruco_dictionary
 from aqualvs.errors import CalibrationError, OptionError
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
 
@@ -55,8 +55,7 @@ class SheetPatch:
     corners: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Wall:
+class _Wall(NamedTuple):
     """Wall of the box with axes right and down as seen from inside; `origin` is its top left."""
 
     plane: Plane
@@ -85,12 +84,13 @@ def box_patches(
     patches: list[SheetPatch] = []
     walls = _walls(plan)
     for name, wall in walls.items():
-        first = plan.first_id + len(ids)
         placed = _grid(wall, pitch, plan.marker)
-        patches += _patches(name, placed, first, pitch, plan.marker, rooms)
-        numbers = first + np.arange(placed.shape[0] * placed.shape[1])
+        numbers = plan.first_id + len(ids) + np.arange(placed[..., 0].size)
+        patches += _patches(name, placed, numbers, pitch, plan.marker, rooms)
         ids += numbers.tolist()
-        corners += [_in_box(wall, corner, plan.marker) for corner in placed.reshape(-1, 2)]
+        unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        flat = placed.reshape(-1, 1, 2) + plan.marker * unit
+        corners.append(wall.origin + flat[..., :1] * wall.right + flat[..., 1:] * wall.down)
         names += [name] * len(numbers)
     held = len(aruco_dictionary(plan.family).bytesList)
     if plan.first_id < 0 or ids[-1] >= held:
@@ -102,7 +102,7 @@ def box_patches(
         frame="box",
         family=plan.family,
         ids=np.array(ids, np.int64),
-        corners=np.array(corners),
+        corners=np.concatenate(corners),
         plane_names=tuple(names),
         planes={name: wall.plane for name, wall in walls.items()},
     )
@@ -152,15 +152,20 @@ def _grid(wall: _Wall, pitch: float, marker: float) -> FloatArray:
 def _patches(
     name: str,
     placed: FloatArray,
-    first: int,
+    numbers: IntArray,
     pitch: float,
     marker: float,
     rooms: Sequence[tuple[float, float]],
 ) -> list[SheetPatch]:
     """Cut a wall's grid into the fewest blocks of whole cells that fit a sheet."""
     rows, columns = placed.shape[:2]
-    numbers = first + np.arange(rows * columns).reshape(rows, columns)
-    ways = [_block(room, pitch, rows, columns) for room in rooms if min(room) >= pitch]
+    numbers = numbers.reshape(rows, columns)
+    # Numbers of rows and columns of cells on a sheet.
+    ways = [
+        (int(min(high / pitch + 1e-9, rows)), int(min(wide / pitch + 1e-9, columns)))
+        for wide, high in rooms
+        if min(wide, high) >= pitch
+    ]
     n_down, n_across = min(ways, key=lambda way: -(-rows // way[0]) * -(-columns // way[1]))
     inset = 0.5 * (pitch - marker)
     patches = []
@@ -180,17 +185,6 @@ def _patches(
     return patches
 
 
-def _block(room: tuple[float, float], pitch: float, rows: int, columns: int) -> tuple[int, int]:
-    """Return the numbers of rows and columns of cells on a sheet."""
-    return int(min(room[1] / pitch + 1e-9, rows)), int(min(room[0] / pitch + 1e-9, columns))
-
-
-def _in_box(wall: _Wall, corner: FloatArray, marker: float) -> FloatArray:
-    """Return a marker's corners (4, 3) in `box`."""
-    flat = corner + marker * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    return wall.origin + flat[:, :1] * wall.right + flat[:, 1:] * wall.down
-
-
 def board_rectangles(board: Board) -> FloatArray:
     """Return x, y, width, height (N, 4) of a board's black areas, in `board`, metres."""
     n_x, n_y = board.squares
@@ -208,16 +202,9 @@ def board_rectangles(board: Board) -> FloatArray:
 
 
 def marker_rectangles(family: str, number: int, corner: FloatArray, size: float) -> FloatArray:
-    """Return x, y, width, height (N, 4) of a marker's black areas.
+    """Return x, y, width, height (N, 4) of the black areas of a dictionary's marker.
 
-    Parameters
-    ----------
-    family : str
-        Name of the dictionary.
-    corner : array, shape (2,)
-        The marker's top-left corner, in the unit of `size`.
-    size : float
-        Side of the marker.
+    `corner` (2,) is its top left, `size` its side, in one unit.
     """
     cells = marker_cells(family, number)[1:-1, 1:-1]
     cell = size / len(cells)
@@ -353,18 +340,8 @@ class Paper:
     @property
     def room_mm(self) -> tuple[float, float]:
         """Printable width and height, less the ruler's strip."""
-        if self.size_mm is None:
-            return np.inf, np.inf
-        return self.size_mm[0] - 2.0 * _PRINT.edge_mm, self.size_mm[
-            1
-        ] - 2.0 * _PRINT.edge_mm - _PRINT.strip_mm
-
-    def page_mm(self, width: float, height: float) -> tuple[float, float]:
-        """Return the page's size for a print of this size."""
-        if self.size_mm is not None:
-            return self.size_mm
-        wide = max(width, _PRINT.ruler_mm + 60.0)
-        return wide + 2.0 * _PRINT.edge_mm, height + 2.0 * _PRINT.edge_mm + _PRINT.strip_mm
+        width, height = self.size_mm or (np.inf, np.inf)
+        return width - 2.0 * _PRINT.edge_mm, height - 2.0 * _PRINT.edge_mm - _PRINT.strip_mm
 
 
 def papers(word: str) -> tuple[Paper, Paper]:
@@ -411,30 +388,26 @@ def best_paper(word: str, width: float, height: float, what: str) -> Paper:
 def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words: str) -> PdfPage:
     """Return a page with a print in its middle, a ruler to check the scale, and a caption.
 
-    Parameters
-    ----------
-    paper : Paper
-        With room for the print.
-    rectangles : array, shape (N, 4)
-        x, y, width, height of the black areas, from the print's top left, millimetres.
-    size : (float, float)
-        Width and height of the print, light border included, in millimetres.
-    words : str
-        Caption, in small print.
+    `rectangles` (N, 4): x, y, width, height of the black areas, from the print's top left. `size`:
+    width and height of the print, light border included. All in millimetres.
     """
-    width, height = paper.page_mm(*size)
-    left, top = 0.5 * (width - size[0]), _PRINT.edge_mm
-    if paper.size_mm is not None:
+    edge = _PRINT.edge_mm
+    if paper.size_mm is None:
+        width = max(size[0], _PRINT.ruler_mm + 60.0) + 2.0 * edge
+        height, top = size[1] + 2.0 * edge + _PRINT.strip_mm, edge
+    else:
+        width, height = paper.size_mm
         top = 0.5 * (height - _PRINT.strip_mm - size[1])
+    left = 0.5 * (width - size[0])
     placed = rectangles + np.array([left, top, 0.0, 0.0])
-    ruler_y = height - _PRINT.edge_mm - 8.0
+    ruler_y = height - edge - 8.0
     scale = "the line above measures exactly 100 mm: print at 100 %, without fitting to the page"
     text_mm = 3.2
     texts = (
-        Text(_PRINT.edge_mm, height - _PRINT.edge_mm - 4.2, text_mm, words),
-        Text(_PRINT.edge_mm, height - _PRINT.edge_mm, text_mm, scale),
+        Text(edge, height - edge - 4.2, text_mm, words),
+        Text(edge, height - edge, text_mm, scale),
     )
-    return PdfPage(width, height, np.concatenate([placed, ruler(_PRINT.edge_mm, ruler_y)]), texts)
+    return PdfPage(width, height, np.concatenate([placed, ruler(edge, ruler_y)]), texts)
 
 
 def ruler(x: float, y: float) -> FloatArray:
@@ -449,12 +422,12 @@ def ruler(x: float, y: float) -> FloatArray:
 
 def outline(x: float, y: float, width: float, height: float) -> FloatArray:
     """Return the rectangles (4, 4) of a hairline to cut along, in its middle."""
-    half = 0.5 * _PRINT.hair_mm
+    hair, half = _PRINT.hair_mm, 0.5 * _PRINT.hair_mm
     return np.array(
         [
-            [x - half, y - half, width + _PRINT.hair_mm, _PRINT.hair_mm],
-            [x - half, y + height - half, width + _PRINT.hair_mm, _PRINT.hair_mm],
-            [x - half, y + half, _PRINT.hair_mm, height - _PRINT.hair_mm],
-            [x + width - half, y + half, _PRINT.hair_mm, height - _PRINT.hair_mm],
+            [x - half, y - half, width + hair, hair],
+            [x - half, y + height - half, width + hair, hair],
+            [x - half, y + half, hair, height - hair],
+            [x + width - half, y + half, hair, height - hair],
         ]
     )

@@ -9,7 +9,7 @@ markers at known places their sizes, corner order, planes and units.
 import difflib
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -44,24 +44,23 @@ _FREE_TEXT = re.compile(
 )
 
 
-def read_mapping(path: Path, what: str) -> dict[Any, Any]:
-    """Return the keys and values of a YAML file; `what` names its kind in messages.
+PartT = TypeVar("PartT", bound=StrictPart)
 
-    Raises `CalibrationError` with one line, if the file cannot be read or does not hold keys and
-    values.
-    """
+
+def _quoted(match: re.Match[str]) -> str:
+    text = match["text"].replace("'", "''")
+    return f"{match[1]}: '{text}'"
+
+
+def _read(path: Path, what: str, schema: type[PartT]) -> PartT:
+    """Return the content of a YAML file; `what` names its kind in messages."""
     raw = read_text(path, what, CalibrationError)
     refuse_foreign(raw, path, what, CalibrationError)
     text = _FREE_TEXT.sub(_quoted, raw)
     content = parse_yaml(text, str(path), CalibrationError)
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: holds no keys; give the path of {what}")
-    return content
-
-
-def _quoted(match: re.Match[str]) -> str:
-    text = match["text"].replace("'", "''")
-    return f"{match[1]}: '{text}'"
+    return validated(schema, content, path, CalibrationError, _WORDS)
 
 
 Count = Annotated[int, Field(ge=2, le=1000)]
@@ -162,24 +161,6 @@ class _Tolerances(NamedTuple):
 _TOLERANCES = _Tolerances()
 
 _UNITS = {1e-3: "metres", 1e-1: "centimetres"}
-
-
-def check_markers(file: MarkersFile, frame: str, source: Path) -> None:
-    """Check the markers of a file as a whole; lengths in it are millimetres.
-
-    Raises `CalibrationError` with one line on the first fault: file, marker, value, remedy.
-    """
-    try:
-        _check_ids(file)
-        planes = {name: _plane(name, part.normal, part.d) for name, part in file.planes.items()}
-        for part in file.markers:
-            _check_shape(part)
-            _check_plane(part, planes)
-        corners = np.array([part.corners for part in file.markers])
-        _check_extent(corners, frame)
-        _check_facing(file, corners, frame)
-    except CalibrationError as fault:
-        raise CalibrationError(f"{source}: {fault}") from None
 
 
 def _check_ids(file: MarkersFile) -> None:
@@ -302,28 +283,31 @@ def load_board(path: str | Path) -> Board:
     Raises `CalibrationError` with one line that names the file, the value and the remedy.
     """
     source = Path(path)
-    content = read_mapping(source, "a board.yaml")
-    file = validated(BoardFile, content, source, CalibrationError, _WORDS)
+    file = _read(source, "a board.yaml", BoardFile)
     kind = _board_kind(file, source)
     if not _TOLERANCES.square_mm[0] <= file.square_mm <= _TOLERANCES.square_mm[1]:
-        raise CalibrationError(f"{source}: {_unlikely_square(file.square_mm)}")
+        unit = "metres" if file.square_mm < 0.5 else "centimetres"
+        too_small = file.square_mm < _TOLERANCES.square_mm[0]
+        looks = f"it looks like {unit}" if too_small else "no camera sees one whole"
+        raise CalibrationError(
+            f"{source}: square_mm is {file.square_mm:g}; {looks}, give the side of a square in "
+            "millimetres"
+        )
+    squares = _squares(file, source)
+    if file.dictionary:
+        _check_dictionary(file.dictionary, "dictionary", source)
     try:
         return Board(
             kind=kind,
-            squares=_squares(file, source),
+            squares=squares,
             square=file.square_mm / _MM,
             marker=(file.marker_mm or 0.0) / _MM,
-            dictionary=_known_dictionary(file.dictionary, "dictionary", source)
-            if file.dictionary
-            else "",
+            dictionary=file.dictionary or "",
             border=file.border_mm / _MM,
             legacy_pattern=file.legacy_pattern,
         )
     except CalibrationError as fault:
-        text = str(fault)
-        raise CalibrationError(
-            text if text.startswith(str(source)) else f"{source}: {text}"
-        ) from None
+        raise CalibrationError(f"{source}: {fault}") from None
 
 
 def _board_kind(file: BoardFile, source: Path) -> BoardKind:
@@ -357,44 +341,21 @@ def _squares(file: BoardFile, source: Path) -> tuple[int, int]:
     return (x + 1, y + 1) if any(inner) else (x, y)
 
 
-def _unlikely_square(square_mm: float) -> str:
-    unit = (
-        "metres"
-        if square_mm < 0.5
-        else "centimetres"
-        if square_mm < _TOLERANCES.square_mm[0]
-        else ""
-    )
-    looks = f"it looks like {unit}" if unit else "no camera sees one whole"
-    return f"square_mm is {square_mm:g}; {looks}, give the side of a square in millimetres"
-
-
-def _known_dictionary(name: str, key: str, source: Path) -> str:
+def _check_dictionary(name: str, key: str, source: Path) -> None:
     if dictionary_id(name) is None:
         raise CalibrationError(
             f"{source}: {key} is {name!r}, which is unknown; {dictionary_hint(name)}"
         )
-    return name
 
 
 def load_box(path: str | Path) -> tuple[MarkerSet, float | None]:
-    """Load a `box.yaml`: markers on planes, in the box's own frame.
+    """Load a `box.yaml`: markers on planes, in the box's own frame, and the stated medium's index.
 
-    Returns
-    -------
-    markers : MarkerSet
-        In `box`; every marker lies on one of the planes.
-    n_nominal : float or None
-        Stated index of the medium of the pictures.
-
-    Raises
-    ------
-    CalibrationError
-        One line that names the file, the value and the remedy.
+    The index is None if the file does not say in which medium pictures were taken. Raises
+    `CalibrationError` with one line that names the file, the value and the remedy.
     """
     source = Path(path)
-    content = read_mapping(source, "a box.yaml")
-    file = validated(MarkersFile, content, source, CalibrationError, _WORDS)
+    file = _read(source, "a box.yaml", MarkersFile)
     if not file.planes:
         raise CalibrationError(
             f"{source}: planes is missing; a box has planes, each with 'normal' and 'd'"
@@ -415,8 +376,7 @@ def load_target(path: str | Path) -> MarkerSet:
     Raises `CalibrationError` with one line that names the file, the value and the remedy.
     """
     source = Path(path)
-    content = read_mapping(source, "a target.yaml")
-    file = validated(MarkersFile, content, source, CalibrationError, _WORDS)
+    file = _read(source, "a target.yaml", MarkersFile)
     if (file.frame or "").startswith("plate"):
         raise CalibrationError(
             f"{source}: frame is plate, so its corners are not in the dome's frame; measure the "
@@ -426,18 +386,28 @@ def load_target(path: str | Path) -> MarkerSet:
 
 
 def _markers(file: MarkersFile, frame: str, source: Path) -> MarkerSet:
-    family = _known_dictionary(file.family, "family", source)
+    _check_dictionary(file.family, "family", source)
     if file.corner_order is not None and _CORNER_ORDER not in file.corner_order:
         raise CalibrationError(
             f"{source}: corner_order is {file.corner_order!r}; this aqualvs reads only "
             f"'{_CORNER_ORDER}', so reorder the corners"
         )
-    check_markers(file, frame, source)
+    try:
+        _check_ids(file)
+        planes = {name: _plane(name, part.normal, part.d) for name, part in file.planes.items()}
+        for part in file.markers:
+            _check_shape(part)
+            _check_plane(part, planes)
+        corners = np.array([part.corners for part in file.markers])
+        _check_extent(corners, frame)
+        _check_facing(file, corners, frame)
+    except CalibrationError as fault:
+        raise CalibrationError(f"{source}: {fault}") from None
     return MarkerSet(
         frame=frame,
-        family=family,
+        family=file.family,
         ids=np.array([part.id for part in file.markers], np.int64),
-        corners=np.array([part.corners for part in file.markers], np.float64) / _MM,
+        corners=corners / _MM,
         plane_names=tuple(part.plane for part in file.markers),
         planes={
             name: Plane.from_normal(part.normal, part.d / _MM) for name, part in file.planes.items()

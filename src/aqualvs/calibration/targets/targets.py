@@ -139,10 +139,8 @@ class Board:
                 f"a board with squares of {_mm(self.square)} and a border of {_mm(self.border)}; "
                 "lengths must be positive"
             )
-        if self.kind is BoardKind.CHARUCO:
-            self._check_markers()
-
-    def _check_markers(self) -> None:
+        if self.kind is not BoardKind.CHARUCO:
+            return
         if not 0.0 < self.marker < self.square:
             raise CalibrationError(
                 f"markers of {_mm(self.marker)} on squares of {_mm(self.square)}; a marker is "

@@ -37,7 +37,6 @@ from aqualvs.calibration.water_index.state import (
     IndexState,
     IndexStep,
     N,
-    contradicts,
 )
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
@@ -157,10 +156,7 @@ class IndexEstimator:
         return self._model.line(self.state, frame).residuals.reshape(-1, 2)
 
     def _model_about(self, middle: FloatArray) -> IndexModel:
-        options = self.options
-        return IndexModel(
-            self.rig, self.uncertainty, options.pose_sigmas, options.sigma_corner_px, middle
-        )
+        return IndexModel(self.rig, self.uncertainty, self.options, middle)
 
     def _refusal(self, frame: FrameCorners) -> str:
         if not math.isfinite(frame.time):
@@ -270,7 +266,10 @@ class IndexEstimator:
     ) -> IndexReading:
         own, prior = self._own, self.prior
         if own is not None and prior is not None:
-            self._contradicted = contradicts(own, prior, self._contradicted)
+            # With hysteresis, in standard deviations.
+            limit = 3.0 if self._contradicted else 4.0
+            sigma = math.hypot(math.sqrt(own.covariance[ANCHOR, ANCHOR]), prior.sigma)
+            self._contradicted = abs(float(own.mean[ANCHOR]) - prior.n) > limit * sigma
         sigma_frame = self._sigma_frame * self._test.inflation
         joint = self.state
         observable = self._is_observable(own, joint)
@@ -449,25 +448,10 @@ def calibrate_water(
 ) -> WaterCalibration:
     """Find the index of the medium from pictures of a target fixed on the vehicle.
 
-    Parameters
-    ----------
-    rig : Rig
-        Behind a housing; its own index is the initial guess without a prior.
-    views : sequence of View
-        Points of the target in `dome`, metres.
-    times : sequence of float, optional
-        Of the pictures, in seconds, ascending. Without them all pictures are simultaneous.
-    uncertainty : RigUncertainty, optional
-        Of the rig; without it the rig is taken as exact.
-    prior : IndexPrior, optional
-        Prior of the index at the first picture.
-    options : IndexOptions
-        Assumptions about target and medium.
-
-    Raises
-    ------
-    CalibrationError
-        If the rig has no housing or no picture can be used.
+    Points of the target are in `dome`, metres. `times` are in seconds, ascending; without them all
+    pictures are simultaneous. Without a prior of the index at the first picture the rig's own is
+    the initial guess; without an uncertainty the rig is exact. Raises `CalibrationError` if the rig
+    has no housing or no picture can be used.
     """
     known = RigUncertainty.none() if uncertainty is None else uncertainty
     estimator = IndexEstimator(rig, uncertainty=known, options=options, prior=prior)
@@ -476,8 +460,16 @@ def calibrate_water(
         estimator.add(float(time), view) for time, view in zip(moments, views, strict=True)
     )
     state = estimator.state
+    if not readings:
+        raise CalibrationError(
+            "no pictures of the target; give some on which the whole target is seen"
+        )
     if state is None:
-        raise CalibrationError(_why_none(readings))
+        raise CalibrationError(
+            f"none of {len(readings)} pictures can be used: {readings[0].name}: "
+            f"{readings[0].refused}; check that target.yaml gives the target's corners in the "
+            "frame of the dome, in millimetres"
+        )
     last = readings[-1]
     return WaterCalibration(
         rig=rig.in_water(max(state.n, 1.0)),
@@ -494,16 +486,6 @@ def calibrate_water(
             if reading
         },
         remarks=last.remarks,
-    )
-
-
-def _why_none(readings: Sequence[IndexReading]) -> str:
-    if not readings:
-        return "no pictures of the target; give some on which the whole target is seen"
-    first = readings[0]
-    return (
-        f"none of {len(readings)} pictures can be used: {first.name}: {first.refused}; check that "
-        "target.yaml gives the target's corners in the frame of the dome, in millimetres"
     )
 
 

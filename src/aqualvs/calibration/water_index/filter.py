@@ -23,6 +23,7 @@ from aqualvs.calibration.water_index.state import (
     FAR,
     FIRST_CAMERA,
     POSE,
+    IndexOptions,
     IndexState,
     N,
     first_state,
@@ -95,11 +96,7 @@ class IndexModel:
 
     rig: Rig  # Behind a housing; its own `n_water` plays no part.
     uncertainty: RigUncertainty  # Of the camera's numbers.
-    # Shape (6,): standard deviations of the target's place: turn about its middle (radians), shift
-    # (metres).
-    pose_sigmas: FloatArray
-    # Standard deviation of the constant error of a corner, in pixels.
-    sigma_corner: float
+    options: IndexOptions  # Uncertainty of the target's place and corners.
     # Shape (3,): centre of the target's turn, in `dome`.
     middle: FloatArray
     # Numbers of the camera that are uncertain, in the state's order.
@@ -123,10 +120,10 @@ class IndexModel:
 
     def first(self, frame: FrameCorners, n: float) -> IndexState:
         """Return the state before a first frame, with the index searched from `n`."""
-        camera = self.uncertainty.of(self.camera_names)
-        blank = first_state(frame.time, n, self.pose_sigmas, camera)
-        state = first_state(frame.time, self.nearest(blank, frame), self.pose_sigmas, camera)
-        return state.with_corners(frame.ids, self.sigma_corner)
+        known = self.options.pose_sigmas, self.uncertainty.of(self.camera_names)
+        n = self.nearest(first_state(frame.time, n, *known), frame)
+        state = first_state(frame.time, n, *known)
+        return state.with_corners(frame.ids, self.options.sigma_corner_px)
 
     def jumped(self, state: IndexState, frame: FrameCorners) -> IndexState:
         """Return the state after a jump of the index to the value by a frame."""
@@ -139,7 +136,8 @@ class IndexModel:
         predicted = frame.pixels - line.residuals.reshape(-1, 2)
         visible = np.isfinite(predicted[:, 0])
         ids = frame.where(visible).ids
-        return state.with_corners_at(ids, predicted[visible], self.sigma_corner) if ids else state
+        sigma_px = self.options.sigma_corner_px
+        return state.with_corners_at(ids, predicted[visible], sigma_px) if ids else state
 
     def line(self, state: IndexState, frame: FrameCorners) -> Line:
         """Return the prediction of a frame near a state; residuals are NaN for unseen corners.
@@ -296,8 +294,7 @@ class Innovation:
         return 2 * len(self.frame.ids) > self.n_points and len(self.frame.ids) >= MIN_POINTS
 
 
-@dataclass(frozen=True, slots=True)
-class Update:
+class Update(NamedTuple):
     """Updated state after a frame."""
 
     state: IndexState
@@ -309,14 +306,8 @@ class Update:
 def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: float) -> Innovation:
     """Return the innovation of a frame: its difference from the prediction by a state.
 
-    Parameters
-    ----------
-    state : IndexState
-        At the frame's time, with entries for its corners.
-    frame : FrameCorners
-        At least one corner.
-    noise : float
-        Standard deviation of a coordinate, in pixels.
+    The state is at the frame's time, with entries for its corners, of which there is at least one;
+    `noise` is the standard deviation of a coordinate, in pixels.
     """
     line, moved = model.line(state, frame), 0.0
     if abs(median_shift(line)) > LINEAR:
@@ -325,7 +316,11 @@ def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
         line, moved = model.line(at_index(state, n, slopes_too=far), frame), n - state.n
         state = model.settled(state, line, frame)
     keep = np.isfinite(line.residuals[::2])
-    keep[keep] &= _left_over(state, _rows(line, keep), noise) < _REJECT
+    seen = _rows(line, keep)
+    # Residuals that no change of index explains, in standard deviations.
+    left = seen.residuals - seen.slopes[:, N] * median_shift(seen)
+    spread = _spread(state, seen, noise)
+    keep[keep] &= _lengths(left / np.sqrt(np.diag(spread) - _by_index(spread, seen)[0])) < _REJECT
     line = _rows(line, keep)
     shift, variance, misfit = _best_shift(state, line, noise)
     squares = float(np.sum(line.slopes[:, N] ** 2))
@@ -336,16 +331,9 @@ def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
 
 
 def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: float) -> Update:
-    """Return the state updated by a frame whose corners fit it.
+    """Return the state updated by a frame whose corners, all of them visible, fit it.
 
-    Parameters
-    ----------
-    state : IndexState
-        At the frame's time, with entries for its corners.
-    frame : FrameCorners
-        At least one corner, all of them visible.
-    noise : float
-        Standard deviation of a coordinate, in pixels.
+    Arguments as in `compare`.
     """
     state = state.with_slopes_near()
     state = model.settled(state, model.line(state, frame), frame)
@@ -354,58 +342,35 @@ def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
     passes = 5
     for _ in range(passes):
         used = weights
-        step = _kalman_step(state, at, model.line(at, frame), np.repeat(noise**2 / used, 2))
-        lengths = _lengths(step.left / np.sqrt(step.expected))
-        close = abs(step.mean[N] - at.n) < LINEAR
-        at = replace(state, mean=step.mean)
+        line, variances = model.line(at, frame), np.repeat(noise**2 / used, 2)
+        # Kalman update with a prediction that is linear about `at`.
+        differences = line.residuals + line.slopes @ (at.mean - state.mean)
+        reach = state.covariance @ line.slopes.T
+        spread = line.slopes @ reach
+        spread.flat[:: len(spread) + 1] += variances
+        factor = cho_factor(spread)
+        mean = state.mean + reach @ cho_solve(factor, differences)
+        # Remaining residuals and their expected squares.
+        left = differences - line.slopes @ (mean - state.mean)
+        expected = variances**2 * np.diag(cho_solve(factor, np.eye(len(spread))))
+        lengths = _lengths(left / np.sqrt(expected))
+        close = abs(mean[N] - at.n) < LINEAR
+        at = replace(state, mean=mean)
         weights = np.where(lengths < _REJECT, RobustLoss.HUBER.weight(lengths), rejected)
         if close and np.allclose(weights, used, atol=0.05):
             break
     good = np.repeat(used > rejected, 2)
-    rms = float(np.sqrt(np.mean(step.left[good] ** 2))) if np.any(good) else np.nan
+    rms = float(np.sqrt(np.mean(left[good] ** 2))) if np.any(good) else np.nan
     # Median of the square of a normal deviate.
     half = 0.4549
-    estimate = noise * np.sqrt(np.median(step.left**2 / step.expected) / half)
-    information = 1.0 / state.random_variance + step.information
-    after = replace(at, covariance=step.covariance(), random_variance=1.0 / information)
+    estimate = noise * np.sqrt(np.median(left**2 / expected) / half)
+    # Of the frame on the index if all else was known.
+    information = 1.0 / state.random_variance + float(np.sum(line.slopes[:, N] ** 2 / variances))
+    covariance = state.covariance - reach @ cho_solve(factor, reach.T)
+    after = replace(
+        at, covariance=0.5 * (covariance + covariance.T), random_variance=1.0 / information
+    )
     return Update(after, int(np.count_nonzero(good)) // 2, rms, float(estimate))
-
-
-class _KalmanStep(NamedTuple):
-    """Kalman update: new mean of a state, remaining residuals, and their expected squares.
-
-    `left` and `expected` (2M,) are in pixels and their squares; `information` is that of the frame
-    on the index if all else was known.
-    """
-
-    mean: FloatArray
-    left: FloatArray
-    expected: FloatArray
-    information: float
-    old_covariance: FloatArray
-    reach: FloatArray
-    factor: tuple[FloatArray, bool]
-
-    def covariance(self) -> FloatArray:
-        """Return the new covariance."""
-        new = self.old_covariance - self.reach @ cho_solve(self.factor, self.reach.T)
-        return 0.5 * (new + new.T)
-
-
-def _kalman_step(
-    state: IndexState, at: IndexState, line: Line, variances: FloatArray
-) -> _KalmanStep:
-    """Solve for the mean with a prediction that is linear about `at`."""
-    differences = line.residuals + line.slopes @ (at.mean - state.mean)
-    reach = state.covariance @ line.slopes.T
-    spread = line.slopes @ reach
-    spread.flat[:: len(spread) + 1] += variances
-    factor = cho_factor(spread)
-    mean = state.mean + reach @ cho_solve(factor, differences)
-    left = differences - line.slopes @ (mean - state.mean)
-    expected = variances**2 * np.diag(cho_solve(factor, np.eye(len(spread))))
-    information = float(np.sum(line.slopes[:, N] ** 2 / variances))
-    return _KalmanStep(mean, left, expected, information, state.covariance, reach, factor)
 
 
 def _rows(line: Line, keep: BoolArray) -> Line:
@@ -422,13 +387,6 @@ def _spread(state: IndexState, line: Line, noise: float) -> FloatArray:
     spread: FloatArray = line.slopes @ state.covariance @ line.slopes.T
     spread.flat[:: len(spread) + 1] += noise**2
     return spread
-
-
-def _left_over(state: IndexState, line: Line, noise: float) -> FloatArray:
-    """Return lengths (M,) of residuals that no change of index explains, in standard deviations."""
-    left = line.residuals - line.slopes[:, N] * median_shift(line)
-    spread = _spread(state, line, noise)
-    return _lengths(left / np.sqrt(np.diag(spread) - _by_index(spread, line)[0]))
 
 
 def _by_index(spread: FloatArray, line: Line) -> tuple[FloatArray, float, FloatArray]:

@@ -188,16 +188,9 @@ class IndexState:
         """Return the state with corner errors valid at the pixels of the corners.
 
         The error of a detector depends on the place of a corner within its pixel: after a motion of
-        the picture by a good part of a pixel, new errors replace the old ones.
-
-        Parameters
-        ----------
-        ids : tuple of int
-            Corners of a picture, all known.
-        pixels : array, shape (M, 2)
-            Their predicted places.
-        sigma_px : float
-            Standard deviation of the errors.
+        the picture by a good part of a pixel, new errors, of standard deviation `sigma_px`, replace
+        the old ones. `ids` are the corners of a picture, all known, `pixels` (M, 2) their predicted
+        places.
         """
         rows = [self.ids.index(i) for i in ids]
         moved = pixels - self.seen_at[rows]
@@ -209,21 +202,18 @@ class IndexState:
         same_px, still_px = 0.4, 0.1
         if way > still_px:
             kept = math.exp(-((way / same_px) ** 2))
-            state = self._with_corners_renewed(kept, sigma_px)
+            mean, covariance = self.mean.copy(), self.covariance.copy()
+            first = len(mean) - 2 * len(self.ids)
+            mean[first:] *= kept
+            covariance[first:] *= kept
+            covariance[:, first:] *= kept
+            corners = np.arange(first, len(mean))
+            covariance[corners, corners] += (1.0 - kept**2) * sigma_px**2
+            state = replace(self, mean=mean, covariance=covariance)
             seen_at[:] = np.nan
         fresh = ~np.isfinite(seen_at[rows, 0])
         seen_at[np.array(rows)[fresh]] = pixels[fresh]
         return replace(state, seen_at=seen_at)
-
-    def _with_corners_renewed(self, kept: float, sigma_px: float) -> "IndexState":
-        mean, covariance = self.mean.copy(), self.covariance.copy()
-        first = len(mean) - 2 * len(self.ids)
-        mean[first:] *= kept
-        covariance[first:] *= kept
-        covariance[:, first:] *= kept
-        rows = np.arange(first, len(mean))
-        covariance[rows, rows] += (1.0 - kept**2) * sigma_px**2
-        return replace(self, mean=mean, covariance=covariance)
 
     def given_anchor(self, n: float, sigma: float) -> "IndexState":
         """Return the state after a Kalman update of the anchor with `n` and `sigma`."""
@@ -237,18 +227,10 @@ class IndexState:
 
 
 def first_state(time: float, n: float, pose_sigmas: FloatArray, camera: FloatArray) -> IndexState:
-    """Return the state before any frame.
+    """Return the state before any frame, at a time in seconds, with an initial guess of the index.
 
-    Parameters
-    ----------
-    time : float
-        In seconds.
-    n : float
-        Initial guess of the index.
-    pose_sigmas : array, shape (6,)
-        Of the target's place: turn (radians) and shift (metres).
-    camera : array, shape (C, C)
-        Covariance of the camera's numbers.
+    `pose_sigmas` (6,) are of the target's place: turn (radians) and shift (metres); `camera` (C, C)
+    is the covariance of the camera's numbers.
     """
     size = FIRST_CAMERA + len(camera)
     mean, covariance = np.zeros(size), np.zeros((size, size))
@@ -421,13 +403,3 @@ class CusumTest:
         squared = self.inflation**2 * (1.0 + share * (square - 1.0))
         self.inflation = float(np.sqrt(min(max(squared, 1.0), 100.0)))
         self._block = []
-
-
-def contradicts(own: IndexState, prior: IndexPrior, before: bool) -> bool:
-    """Return whether pictures and prior disagree; `before` is the last answer.
-
-    With hysteresis: they disagree beyond four standard deviations, and agree again below three.
-    """
-    apart = abs(float(own.mean[ANCHOR]) - prior.n)
-    sigma = math.hypot(math.sqrt(own.covariance[ANCHOR, ANCHOR]), prior.sigma)
-    return apart > (3.0 if before else 4.0) * sigma
