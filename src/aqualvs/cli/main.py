@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, TextIO
 
 import typer
+from typer import Option
 
 from aqualvs import __version__
 from aqualvs.cli.batch import batch
@@ -240,7 +241,7 @@ _MAX_MESSAGE = 2000
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+    version: Annotated[bool, Option("--version", help="Show the version and exit.")] = False,
 ) -> None:
     if version:
         typer.echo(f"aqualvs {__version__}")
