@@ -203,7 +203,7 @@ class Lens:
         Newton's method on the exact Jacobian, to machine precision.
         """
         p = as_vectors(pixels, 2, "pixels")
-        directions, valid = _empty(p, 3), np.empty(p.shape[:-1], dtype=np.bool_)
+        directions, valid = np.empty((*p.shape[:-1], 3)), np.empty(p.shape[:-1], dtype=np.bool_)
         directions_all(self.params, p.reshape(-1, 2), directions.reshape(-1, 3), valid.reshape(-1))
         return directions, valid
 
@@ -223,59 +223,11 @@ class Lens:
             False outside the monotone region, and behind the camera for `opencv`.
         """
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
-        pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
+        pixels, valid = np.empty((*d.shape[:-1], 2)), np.empty(d.shape[:-1], dtype=np.bool_)
         from aqualvs.optics.projection import pixels_all
 
         pixels_all(self.params, d.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
-
-    def pixels_with_jacobian(
-        self, directions_in_cam: ArrayLike
-    ) -> tuple[FloatArray, BoolArray, FloatArray]:
-        """Return `pixels` and their derivatives by the direction as given, shape (..., 2, 3)."""
-        d = as_vectors(directions_in_cam, 3, "directions_in_cam")
-        pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
-        jacobian = _empty(d, 2, 3)
-        from aqualvs.optics.projection import pixels_jacobian_all
-
-        pixels_jacobian_all(
-            self.params,
-            d.reshape(-1, 3),
-            pixels.reshape(-1, 2),
-            valid.reshape(-1),
-            jacobian.reshape(-1, 2, 3),
-        )
-        return pixels, valid, jacobian
-
-    def pixels_with_parameter_jacobian(
-        self, directions_in_cam: ArrayLike
-    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-        """Return `pixels_with_jacobian` and the derivatives by the intrinsics.
-
-        Returns
-        -------
-        pixels, valid, direction_jacobian
-            As `pixels_with_jacobian` gives them.
-        parameter_jacobian : array, shape (..., 2, P)
-            Columns in the order of `parameter_names`; NaN where not valid.
-        """
-        d = as_vectors(directions_in_cam, 3, "directions_in_cam")
-        pixels, valid, jacobian = self.pixels_with_jacobian(d)
-        n_parameters = 4 + len(self.distortion)
-        by_parameter = _empty(d, 2, n_parameters)
-        from aqualvs.optics.projection import intrinsics_jacobian_all
-
-        intrinsics_jacobian_all(
-            self.params,
-            d.reshape(-1, 3),
-            valid.reshape(-1),
-            by_parameter.reshape(-1, 2, n_parameters),
-        )
-        return pixels, valid, jacobian, by_parameter
-
-
-def _empty(like: FloatArray, *shape: int) -> FloatArray:
-    return np.empty((*like.shape[:-1], *shape))
 
 
 def _check(lens: Lens) -> None:

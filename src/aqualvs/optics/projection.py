@@ -61,18 +61,10 @@ def fisheye_pixel(lens: LensParams, x: float, y: float, z: float) -> tuple[bool,
 
 
 @inline_kernel
-def lens_pixel(lens: LensParams, x: float, y: float, z: float) -> tuple[bool, float, float]:
-    """Return (valid, u, v): where the direction (x, y, z) in `cam`, of any length, is seen."""
-    if lens.fisheye:
-        return fisheye_pixel(lens, x, y, z)
-    return opencv_pixel(lens, x, y, z)
-
-
-@inline_kernel
 def opencv_pixel_jacobian(
     lens: LensParams, x: float, y: float, z: float
 ) -> tuple[bool, float, float, Vec, Vec]:
-    """Return `lens_pixel_jacobian` of the opencv model, without branches."""
+    """Return (valid, u, v, gradient of u, gradient of v) of a direction, without branches."""
     inverse = 1.0 / z
     xn, yn = x * inverse, y * inverse
     xd, yd, j_xx, j_xy, j_yy = opencv_distort(lens, xn, yn)
@@ -90,7 +82,7 @@ def opencv_pixel_jacobian(
 def fisheye_pixel_jacobian(
     lens: LensParams, x: float, y: float, z: float
 ) -> tuple[bool, float, float, Vec, Vec]:
-    """Return `lens_pixel_jacobian` of the fisheye model."""
+    """Return (valid, u, v, gradient of u, gradient of v) of a direction."""
     radius = math.sqrt(x * x + y * y)
     theta = math.atan2(radius, z)
     value, slope = fisheye_distort(lens, theta)
@@ -112,47 +104,17 @@ def fisheye_pixel_jacobian(
     )
 
 
-@inline_kernel
-def lens_pixel_jacobian(
-    lens: LensParams, x: float, y: float, z: float
-) -> tuple[bool, float, float, Vec, Vec]:
-    """Return (valid, u, v, gradient of u, gradient of v) with respect to the direction."""
-    if lens.fisheye:
-        return fisheye_pixel_jacobian(lens, x, y, z)
-    return opencv_pixel_jacobian(lens, x, y, z)
-
-
 @kernel
 def pixels_all(
     lens: LensParams, directions: FloatArray, pixels: FloatArray, valid: BoolArray
 ) -> None:
     """Write pixels (N, 2) of directions (N, 3)."""
     for i in range(directions.shape[0]):
-        ok, u, v = lens_pixel(lens, directions[i, 0], directions[i, 1], directions[i, 2])
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        ok, u, v = fisheye_pixel(lens, x, y, z) if lens.fisheye else opencv_pixel(lens, x, y, z)
         valid[i] = ok
         pixels[i, 0] = u if ok else np.nan
         pixels[i, 1] = v if ok else np.nan
-
-
-@kernel
-def pixels_jacobian_all(
-    lens: LensParams,
-    directions: FloatArray,
-    pixels: FloatArray,
-    valid: BoolArray,
-    jacobian: FloatArray,
-) -> None:
-    """Write pixels (N, 2) of directions (N, 3) with their Jacobians (N, 2, 3)."""
-    for i in range(directions.shape[0]):
-        ok, u, v, u_d, v_d = lens_pixel_jacobian(
-            lens, directions[i, 0], directions[i, 1], directions[i, 2]
-        )
-        valid[i] = ok
-        pixels[i, 0] = u if ok else np.nan
-        pixels[i, 1] = v if ok else np.nan
-        for k in range(3):
-            jacobian[i, 0, k] = u_d[k] if ok else np.nan
-            jacobian[i, 1, k] = v_d[k] if ok else np.nan
 
 
 @inline_kernel
@@ -206,20 +168,6 @@ def _write_fisheye(lens: LensParams, x: float, y: float, z: float, jacobian: Flo
         power = power * theta * theta
         jacobian[0, 4 + k] = lens.fx * power * ex
         jacobian[1, 4 + k] = lens.fy * power * ey
-
-
-@kernel
-def intrinsics_jacobian_all(
-    lens: LensParams, directions: FloatArray, valid: BoolArray, jacobian: FloatArray
-) -> None:
-    """Write derivatives (N, 2, 4 + n) of pixels by fx, fy, cx, cy and n distortion coefficients."""
-    for i in range(directions.shape[0]):
-        if valid[i]:
-            write_intrinsics_jacobian(
-                lens, directions[i, 0], directions[i, 1], directions[i, 2], jacobian[i]
-            )
-        else:
-            jacobian[i] = np.nan
 
 
 # Rows of the scratch array: the point, which becomes the direction at the lens, then the pixel;
