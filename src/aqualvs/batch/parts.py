@@ -49,7 +49,6 @@ from aqualvs.results.folder import (
 )
 from aqualvs.results.points import PointsStream, export_points, read_points_stream
 from aqualvs.results.run_request import FrameWindow, RunFile, Status
-from aqualvs.results.summary import RunSummary
 from aqualvs.run_outputs import RunBareLens
 from aqualvs.scanning.row_motion import REACH
 from aqualvs.scanning.scan import Frame
@@ -227,17 +226,6 @@ def _scanner(dive: OpenDive, probe: DiveProbe) -> FrameScanner:
     return _LAST.scanner
 
 
-def joined_summary(dive: OpenDive, pieces: Sequence[Path]) -> RunSummary:
-    """Return the summary that a run of the whole dive would have gathered.
-
-    `pieces`: folders of all pieces, in order.
-    """
-    summary = summary_for(dive)
-    for piece in pieces:
-        summary.extend(piece / SUMMARY)
-    return summary
-
-
 JOINED = "joined"
 """Folder, below a dive's home, with the seal of its result."""
 
@@ -315,7 +303,9 @@ def _write_run_file(
 ) -> dict[str, Any]:
     """Write `run.yaml`; returns the facts of the dive."""
     with open_dive(work.request) as dive:
-        summary = joined_summary(dive, pieces)
+        summary = summary_for(dive)
+    for piece in pieces:
+        summary.extend(piece / SUMMARY)
     fault, facts, rig = results[-1].fault, summary.to_dict(), rig_to_mapping(dive.rig)
     run_file = RunFile(folder / RUN_YAML, probe.source, rig, dive.request.to_dict())
     run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=facts)

@@ -92,15 +92,13 @@ def batch(
     with importing():
         from aqualvs.batch import command as body
         from aqualvs.nets.target_file import net_request
-        from aqualvs.results.run_request import Water, scanner_options
+        from aqualvs.results.run_request import RunRequest, Water, scanner_options
 
-    request = body.BatchRequest(
-        dives=tuple(dives),
-        out=out,
+    run = RunRequest(
+        source="",
         rig=rig,
+        out=out,
         water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
-        scheduler=scheduler,
-        n_workers=workers,
         no_dome=not dome,
         fps=fps,
         scanner=scanner_options(target, detector, mesh_filter, fit),
@@ -110,4 +108,5 @@ def batch(
         report=report,
         net=net_request(wanted=net, twine_mm=twine_mm, stretch_m=stretch_m),
     )
+    request = body.BatchRequest(dives=tuple(dives), run=run, scheduler=scheduler, n_workers=workers)
     raise typer.Exit(body.batch(request, typer.echo))
