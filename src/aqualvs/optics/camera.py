@@ -97,45 +97,6 @@ OX, OY, OZ = ((N_LENS_ROWS + i_row) * BLOCK for i_row in range(3))
 N_RAY_ROWS = N_LENS_ROWS + 3
 
 
-@inline_kernel
-def trace_block(camera: CameraParams, w: FloatArray) -> None:
-    """Turn unit directions in `dome` into rays in the outer medium, all lanes of a block."""
-    for j in range(BLOCK):
-        passed, ox, oy, oz, dx, dy, dz = trace_port(camera.port, w[DX + j], w[DY + j], w[DZ + j])
-        w[OX + j], w[OY + j], w[OZ + j] = ox, oy, oz
-        w[DX + j], w[DY + j], w[DZ + j] = dx, dy, dz
-        w[LENS_OK + j] = w[LENS_OK + j] if passed else -1.0
-
-
-@inline_kernel
-def rotate_block(camera: CameraParams, w: FloatArray) -> None:
-    """Rotate directions from `cam` to `dome`, all lanes of a block."""
-    for j in range(BLOCK):
-        x, y, z = rotate_to_dome(camera, w[DX + j], w[DY + j], w[DZ + j])
-        w[DX + j], w[DY + j], w[DZ + j] = x, y, z
-
-
-@inline_kernel
-def store_rays(
-    start: int,
-    count: int,
-    w: FloatArray,
-    origins: FloatArray,
-    directions: FloatArray,
-    valid: BoolArray,
-) -> None:
-    """Write `count` rays from the scratch `w` to the rows from `start`."""
-    for j in range(count):
-        ok = w[LENS_OK + j] > 0.0
-        valid[start + j] = ok
-        origins[start + j, 0] = w[OX + j] if ok else np.nan
-        origins[start + j, 1] = w[OY + j] if ok else np.nan
-        origins[start + j, 2] = w[OZ + j] if ok else np.nan
-        directions[start + j, 0] = w[DX + j] if ok else np.nan
-        directions[start + j, 1] = w[DY + j] if ok else np.nan
-        directions[start + j, 2] = w[DZ + j] if ok else np.nan
-
-
 @kernel
 def rays_all(
     camera: CameraParams,
@@ -150,9 +111,23 @@ def rays_all(
         count = min(BLOCK, pixels.shape[0] - start)
         load_pixels(camera.lens, pixels, start, count, w)
         directions_block(camera.lens, count, w)
-        rotate_block(camera, w)
-        trace_block(camera, w)
-        store_rays(start, count, w, origins, directions, valid)
+        for j in range(BLOCK):
+            x, y, z = rotate_to_dome(camera, w[DX + j], w[DY + j], w[DZ + j])
+            w[DX + j], w[DY + j], w[DZ + j] = x, y, z
+        for j in range(BLOCK):
+            passed, ox, oy, oz, x, y, z = trace_port(camera.port, w[DX + j], w[DY + j], w[DZ + j])
+            w[OX + j], w[OY + j], w[OZ + j] = ox, oy, oz
+            w[DX + j], w[DY + j], w[DZ + j] = x, y, z
+            w[LENS_OK + j] = w[LENS_OK + j] if passed else -1.0
+        for j in range(count):
+            ok = w[LENS_OK + j] > 0.0
+            valid[start + j] = ok
+            origins[start + j, 0] = w[OX + j] if ok else np.nan
+            origins[start + j, 1] = w[OY + j] if ok else np.nan
+            origins[start + j, 2] = w[OZ + j] if ok else np.nan
+            directions[start + j, 0] = w[DX + j] if ok else np.nan
+            directions[start + j, 1] = w[DY + j] if ok else np.nan
+            directions[start + j, 2] = w[DZ + j] if ok else np.nan
 
 
 def parameter_names(camera: "Camera") -> tuple[str, ...]:

@@ -60,16 +60,6 @@ def directions_block(lens: LensParams, count: int, w: FloatArray) -> None:
             ok, w[DX + j], w[DY + j], w[DZ + j] = fisheye_direction(lens, w[XD + j], w[YD + j])
             w[LENS_OK + j] = 1.0 if ok else -1.0
         return
-    undistort_block(lens, count, w)
-    for j in range(BLOCK):
-        x, y = w[DX + j], w[DY + j]
-        z = 1.0 / math.sqrt(1.0 + x * x + y * y)
-        w[DX + j], w[DY + j], w[DZ + j] = x * z, y * z, z
-
-
-@inline_kernel
-def undistort_block(lens: LensParams, count: int, w: FloatArray) -> None:
-    """Turn distorted into normalised coordinates in DX, DY, all lanes of a block."""
     for j in range(BLOCK):
         xd, yd = w[XD + j], w[YD + j]
         w[DX + j], w[DY + j] = opencv_undistort_start(lens, xd, yd)
@@ -77,7 +67,7 @@ def undistort_block(lens: LensParams, count: int, w: FloatArray) -> None:
     n_open = count
     for _ in range(ROUNDS):
         if n_open == 0:
-            return
+            break
         for j in range(BLOCK):
             x, y, solved = opencv_undistort_round(lens, w[XD + j], w[YD + j], w[DX + j], w[DY + j])
             w[DX + j], w[DY + j] = x, y
@@ -89,6 +79,10 @@ def undistort_block(lens: LensParams, count: int, w: FloatArray) -> None:
         if w[LENS_OK + j] == 0.0:
             ok, w[DX + j], w[DY + j] = opencv_undistort_guarded(lens, w[XD + j], w[YD + j])
             w[LENS_OK + j] = 1.0 if ok else -1.0
+    for j in range(BLOCK):
+        x, y = w[DX + j], w[DY + j]
+        z = 1.0 / math.sqrt(1.0 + x * x + y * y)
+        w[DX + j], w[DY + j], w[DZ + j] = x * z, y * z, z
 
 
 @kernel
@@ -104,9 +98,8 @@ def directions_all(
         for j in range(count):
             ok = w[LENS_OK + j] > 0.0
             valid[start + j] = ok
-            directions[start + j, 0] = w[DX + j] if ok else np.nan
-            directions[start + j, 1] = w[DY + j] if ok else np.nan
-            directions[start + j, 2] = w[DZ + j] if ok else np.nan
+            for k in range(3):
+                directions[start + j, k] = w[DX + k * BLOCK + j] if ok else np.nan
 
 
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

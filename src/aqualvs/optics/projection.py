@@ -188,29 +188,22 @@ def bare_directions_block(port: BareParams, _count: int, w: FloatArray) -> None:
 
 
 @inline_kernel
-def polar_block(port: DomeParams, w: FloatArray) -> None:
-    """Turn points into polar coordinates and the start of the search, all lanes of a block."""
+def dome_directions_block(port: DomeParams, count: int, w: FloatArray) -> None:
+    """Turn points into directions at the lens, in `dome`, all lanes of a block.
+
+    Lanes that no round of steps solves are searched one by one.
+    """
     n_l = port.n_air * port.decentring
     for j in range(BLOCK):
         far, cos_t, sin_t, e = polar_angle(port, w[PX + j], w[PY + j], w[PZ + j])
         w[FAR + j], w[COS_T + j], w[SIN_T + j] = far, cos_t, sin_t
         w[EX + j], w[EY + j], w[EZ + j] = e
         w[OK + j] = 0.0 if is_outside(port, far) else -1.0
-        s = angle_sines(port, far)
-        w[COS_A + j], w[SIN_A + j] = newton_start(s, n_l, cos_t, sin_t)
-
-
-@inline_kernel
-def solve_block(port: DomeParams, count: int, w: FloatArray) -> None:
-    """Solve for the ray's angle at the lens, all lanes of a block; set the signs of validity.
-
-    Lanes that no round of steps solves are searched one by one.
-    """
-    n_l = port.n_air * port.decentring
+        w[COS_A + j], w[SIN_A + j] = newton_start(angle_sines(port, far), n_l, cos_t, sin_t)
     n_open = count
     for _ in range(ROUNDS):
         if n_open == 0:
-            return
+            break
         for j in range(BLOCK):
             s = angle_sines(port, w[FAR + j])
             c, k, solved = three_newton_steps(
@@ -226,25 +219,12 @@ def solve_block(port: DomeParams, count: int, w: FloatArray) -> None:
             s = angle_sines(port, w[FAR + j])
             found, w[COS_A + j], w[SIN_A + j] = bisect_dome(s, n_l, w[COS_T + j], w[SIN_T + j])
             w[OK + j] = 1.0 if found else -1.0
-
-
-@inline_kernel
-def angles_to_directions_block(port: DomeParams, w: FloatArray) -> None:
-    """Turn solved angles into directions at the lens, in `dome`, all lanes of a block."""
     ax, ay, az = port.axis
     for j in range(BLOCK):
         c, k = w[COS_A + j], w[SIN_A + j]
         w[PX + j] = c * ax + k * w[EX + j]
         w[PY + j] = c * ay + k * w[EY + j]
         w[PZ + j] = c * az + k * w[EZ + j]
-
-
-@inline_kernel
-def dome_directions_block(port: DomeParams, count: int, w: FloatArray) -> None:
-    """Turn points into directions at the lens, in `dome`, all lanes of a block."""
-    polar_block(port, w)
-    solve_block(port, count, w)
-    angles_to_directions_block(port, w)
 
 
 @inline_kernel
@@ -445,24 +425,6 @@ def load_points(points: FloatArray, start: int, count: int, w: FloatArray) -> No
         w[PZ + j] = points[start + j, 2]
 
 
-@inline_kernel
-def pixels_block(camera: CameraParams, count: int, w: FloatArray) -> None:
-    """Turn directions in `dome` into pixels, all lanes of a block."""
-    for j in range(BLOCK):
-        x, y, z = rotate_to_cam(camera, w[PX + j], w[PY + j], w[PZ + j])
-        w[PX + j], w[PY + j], w[PZ + j] = x, y, z
-    if camera.lens.fisheye:
-        for j in range(count):
-            seen, u, v = fisheye_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
-            w[PX + j], w[PY + j] = u, v
-            w[OK + j] = w[OK + j] if seen else -1.0
-        return
-    for j in range(BLOCK):
-        seen, u, v = opencv_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
-        w[PX + j], w[PY + j] = u, v
-        w[OK + j] = w[OK + j] if seen else -1.0
-
-
 @kernel
 def project_all(
     camera: CameraParams, points: FloatArray, pixels: FloatArray, valid: BoolArray
@@ -473,7 +435,19 @@ def project_all(
         count = min(BLOCK, points.shape[0] - start)
         load_points(points, start, count, w)
         port_directions_block(camera.port, count, w)
-        pixels_block(camera, count, w)
+        for j in range(BLOCK):
+            x, y, z = rotate_to_cam(camera, w[PX + j], w[PY + j], w[PZ + j])
+            w[PX + j], w[PY + j], w[PZ + j] = x, y, z
+        if camera.lens.fisheye:
+            for j in range(count):
+                seen, u, v = fisheye_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+                w[PX + j], w[PY + j] = u, v
+                w[OK + j] = w[OK + j] if seen else -1.0
+        else:
+            for j in range(BLOCK):
+                seen, u, v = opencv_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+                w[PX + j], w[PY + j] = u, v
+                w[OK + j] = w[OK + j] if seen else -1.0
         for j in range(count):
             ok = w[OK + j] > 0.0
             valid[start + j] = ok
