@@ -10,12 +10,14 @@ Changes: each one is tried with the lasers' angles optimised again (`changes`).
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.design.judge import Judge, StripeSet, predict, score
 from aqualvs.design.settings import Design, Mount, tangential
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 
 TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
@@ -127,8 +129,7 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(NamedTuple):
     """Effect of a change of a design; all numbers are ratios of errors, after to before."""
 
     words: str  # Description of the change.
@@ -156,7 +157,7 @@ def changes(design: Design) -> list[Change]:
     return sorted(found, key=lambda change: change.score)
 
 
-def _measures(design: Design) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _measures(design: Design) -> FloatArray:
     """Return the score, then noise and tolerances for range (as a share) and angles."""
     errors = predict(design)
     parts = [score(design).error]
@@ -166,7 +167,7 @@ def _measures(design: Design) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     return np.array(parts)
 
 
-def _rms(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -202,18 +203,15 @@ def _longer_lens(share: float) -> Callable[[Design], Design]:
 
 def _one_more(design: Design) -> Design | None:
     """Add a laser at the best free place across the axis from an existing one."""
-    tried = [
-        best_angles(design.with_mounts([*design.mounts, _new_mount(design, place)]), quick=True)
-        for place in _free_places(design)
-    ]
-    return min(tried, key=lambda one: score(one).total, default=None)
-
-
-def _new_mount(design: Design, place: tuple[float, float, float]) -> Mount:
     names = {mount.name for mount in design.mounts}
     name = next(name for name in (f"extra_{i}" for i in range(1, 99)) if name not in names)
     tilt, fan = design.mounts[0].tilt, design.mounts[0].fan
-    return Mount(name=name, position=place, stripe=tangential(place), tilt=tilt, fan=fan)
+    added = [
+        Mount(name=name, position=place, stripe=tangential(place), tilt=tilt, fan=fan)
+        for place in _free_places(design)
+    ]
+    tried = (best_angles(design.with_mounts([*design.mounts, one]), quick=True) for one in added)
+    return min(tried, key=lambda one: score(one).total, default=None)
 
 
 def _free_places(design: Design) -> Iterator[tuple[float, float, float]]:

@@ -37,7 +37,7 @@ from aqualvs.schema import (
     parse_settings,
     si_values,
 )
-from aqualvs.yamlfile import parse_yaml, read_yaml
+from aqualvs.yamlfile import read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
 FAN_DEG = 68.0
@@ -197,12 +197,6 @@ def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
         raise OptionError(f"{path}: is not a design file, which begins with '{KEY}: {VERSION}'")
     merged = merged_content(content, given or {})
     return design_from(merged, name=str(path), folder=path.parent)
-
-
-def example_content() -> dict[str, Any]:
-    """Return the content of `EXAMPLE`."""
-    content: dict[str, Any] = parse_yaml(EXAMPLE, "the example", OptionError)
-    return content
 
 
 def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

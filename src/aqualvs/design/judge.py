@@ -155,12 +155,6 @@ def outer(pulls: FloatArray) -> FloatArray:
     return summed
 
 
-def laser_scatter(stripes: Stripes, tolerances: Tolerances) -> FloatArray:
-    """Return the scatter by errors of each laser's plane, shape (K, W, 3, 3)."""
-    sizes = np.array([tolerances.laser_angle, tolerances.laser_angle, tolerances.laser_offset])
-    return outer(stripes.own[..., 2:, :] * sizes[:, None])
-
-
 def posture_covariance(sums: Sums, ranges: FloatArray) -> FloatArray:
     """Return the covariance (..., W, 3, 3) of range, pitch and yaw; NaN if undetermined.
 
@@ -290,7 +284,9 @@ class Judge:
         """Return the stripes of mounts in the picture, with a margin for oblique targets."""
         design, margin = self._design, _MARGIN_SHARE * self._height
         stripes = see_stripes(self._camera, mounts, self._ranges, self._steps, margin)
-        scatter = laser_scatter(stripes, design.tolerances)
+        # By errors of each laser's plane, shape (K, W, 3, 3).
+        angle, offset = design.tolerances.laser_angle, design.tolerances.laser_offset
+        scatter = outer(stripes.own[..., 2:, :] * np.array([angle, angle, offset])[:, None])
         share = net_share(stripes, design)[..., None, None]
         wall, net = wall_parts(stripes, design.noise), net_parts(stripes, design)
         on_wall = wall.matrix, wall.scatter + scatter, stripes.common
