@@ -1,13 +1,12 @@
 """The main path: a frame in, posture and points out."""
 
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from aqualvs.errors import FrameError, OptionError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
@@ -46,10 +45,6 @@ from aqualvs.scanning.triangulate import Triangulator
 if TYPE_CHECKING:
     from aqualvs.scanning.paper.detector import PaperFilter
     from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
-    from aqualvs.scanning.row_motion import RowMotion
-
-
-AnyEnum = TypeVar("AnyEnum", bound=StrEnum)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,16 +81,11 @@ class ScannerOptions:
                     "ThresholdOptions() of aqualvs.scanning.stripe, or MeshFilterOptions() of "
                     "aqualvs.scanning.paper.mesh_filter"
                 )
-        object.__setattr__(self, "target", _enum_member(TargetKind, "target", self.target))
-        object.__setattr__(self, "fit", _enum_member(FitMethod, "fit", self.fit))
-
-
-def _enum_member(kind: type[AnyEnum], name: str, value: str) -> AnyEnum:
-    try:
-        return kind(value)
-    except ValueError:
-        known = ", ".join(kind)
-        raise OptionError(f"ScannerOptions: {name} is {value!r}; give one of {known}") from None
+        for name, kind in (("target", TargetKind), ("fit", FitMethod)):
+            value, known = getattr(self, name), ", ".join(kind)
+            if value not in list(kind):
+                raise OptionError(f"ScannerOptions: {name} is {value!r}; give one of {known}")
+            object.__setattr__(self, name, kind(value))
 
 
 # Number of times that a rival replaces the target, and is tested in its turn.
@@ -162,7 +152,12 @@ class Scanner:
         laser_bands = self._search(0).laser_bands
         self._posture_estimator = PostureEstimator(rig, laser_bands, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera, laser_bands)
-        self._row_motion = self._make_row_motion()
+        self._row_motion = None
+        if rig.shutter.rolls:
+            # Only for rolling shutters.
+            from aqualvs.scanning.row_motion import RowMotion
+
+            self._row_motion = RowMotion(rig)
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
 
     def process(self, frame: Frame) -> Scan:
@@ -272,8 +267,9 @@ class Scanner:
         measurement, points, rows = self._estimate(candidates, search.assignment, has_colour)
         if self._paper_filter is not None:
             # The paper's filter needs the laser of each peak, which is known by now.
-            kept = np.zeros(candidates.n, np.bool_)
-            kept[rows] = _on_mesh(self._paper_filter, points)
+            kept, laser = np.zeros(candidates.n, np.bool_), points.laser.astype(np.int64)
+            found = self._paper_filter.apply(points.pixels, points.width, laser)
+            kept[rows] = found.peaks_on_mesh(len(points))
             candidates = candidates.where(kept)
             measurement, points, _ = self._estimate(candidates, search.assignment, has_colour)
         posture = self._with_rig_covariance(measurement, candidates)
@@ -302,14 +298,6 @@ class Scanner:
 
         every_pixel = not isinstance(self.options.detector, StripeOptions)
         return PaperFilter(self.rig, camera, laser_bands, options, every_pixel=every_pixel)
-
-    def _make_row_motion(self) -> "RowMotion | None":
-        if not self.rig.shutter.rolls:
-            return None
-        # Only for rolling shutters.
-        from aqualvs.scanning.row_motion import RowMotion
-
-        return RowMotion(self.rig)
 
     def _estimate(
         self, candidates: Candidates, assignment: AssignmentTest, has_colour: bool
@@ -568,11 +556,6 @@ def _is_better(again: Measurement, before: Measurement) -> bool:
     # overexposed photographs of a wall. Nets in folds, fitted as solid, have 0.4 and more.
     clearly_less = 0.25
     return not before.folded or again.posture.rms < clearly_less * before.posture.rms
-
-
-def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
-    laser = points.laser.astype(np.int64)
-    return paper_filter.apply(points.pixels, points.width, laser).peaks_on_mesh(len(points))
 
 
 def _ambiguous(one: Plane, other: Plane) -> Refusal:

@@ -87,7 +87,7 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
     Yields what is to be called with the number of frames completed since the last call.
     """
     if _HIDDEN.get():
-        yield _echo_nothing
+        yield lambda _: None
         return
     if not _may_be_terminal():
         units = unit.removesuffix("s") if n_frames == 1 else unit
@@ -146,10 +146,6 @@ def _may_be_terminal() -> bool:
         return sys.stderr.isatty()
     except (AttributeError, ValueError):
         return False
-
-
-def _echo_nothing(n_done: int) -> None:
-    """Do nothing."""
 
 
 @contextlib.contextmanager

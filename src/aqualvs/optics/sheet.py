@@ -273,6 +273,9 @@ class Sheet:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_row", self._pack())
+        if self.window is not None:
+            start = self._plane_beyond()
+            self._row[START : START + 3], self._row[START + 3] = start.normal, start.offset
 
     @property
     def is_plane(self) -> bool:
@@ -513,23 +516,21 @@ class Sheet:
         row[DEPTH] = abs(float(self.window.face.signed_distance(source)))
         row[RATIO], row[SLANT] = self.n_air / self.n_water, float(self.plane.normal @ face)
         row[WINDOWED] = 1.0
-        start = self._plane_beyond(row, source, face)
-        row[START : START + 3], row[START + 3] = start.normal, start.offset
         return row
 
-    def _plane_beyond(self, row: FloatArray, source: FloatArray, face: FloatArray) -> Plane:
+    def _plane_beyond(self) -> Plane:
         """Return the tangent plane `_USUAL_REACH` along the light squarest to the window."""
-        inward = face - row[SLANT] * self.plane.normal
+        face, depth = self._row[FACE:SOURCE], self._row[DEPTH]
+        inward = face - self._row[SLANT] * self.plane.normal
         length = float(np.linalg.norm(inward))
         if length < 1e-6:
             return self.plane
         inward /= length
         bent, _ = refract(inward, -face, n_in=self.n_air, n_out=self.n_water)
-        at = source + row[DEPTH] / float(inward @ face) * inward + _USUAL_REACH * bent
-        tangent = np.empty((1, 4))
-        tangents(row, at[None], tangent)
-        gradient = tangent[0, 1:]
-        return Plane.from_normal(gradient, float(gradient @ at - tangent[0, 0]))
+        source = self._row[SOURCE:DEPTH]
+        return self.tangent_plane(
+            source + depth / float(inward @ face) * inward + _USUAL_REACH * bent
+        )
 
     def _fitted(self, points: FloatArray) -> Plane:
         """Return the least-squares plane of points on the sheet; the tangent plane if too few."""
