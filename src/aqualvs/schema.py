@@ -150,20 +150,10 @@ def validated(
     error: type[AqualvsError],
     words: SchemaWords | None = None,
 ) -> AnyPart:
-    """Return the content of a file as its schema.
+    """Return the content of a file, as read from YAML, as its schema.
 
-    Parameters
-    ----------
-    kind : type
-        What the file may hold.
-    content : object
-        As read from YAML.
-    source : object
-        How messages call the file.
-    error : type
-        What is raised on a fault, with one line: source, place, value, remedy.
-    words : SchemaWords, optional
-        Of messages on this kind of file.
+    `source` is how messages call the file, and `words` are those of messages on this kind of file.
+    Raises `error` on a fault, with one line: source, place, value, remedy.
     """
     try:
         return kind.model_validate(content)
@@ -173,21 +163,10 @@ def validated(
 
 
 def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
-    """Return the content of a file, checked key by key.
+    """Return the content of a file, checked key by key; `kind` is what it may hold.
 
-    Parameters
-    ----------
-    kind : type
-        What the file may hold.
-    key : str
-        First key of such a file, whose value is the version of its format.
-    version : int
-        Version that is read.
-
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    `key` is the first key of such a file, whose value is the version of its format; `version` is
+    that which is read. Raises `OptionError` with one line: file, place, value, remedy.
     """
     content = read_yaml(path, f"a file that begins with '{key}: {version}'", OptionError)
     return parse_settings(content, kind, key, version, str(path))

@@ -119,19 +119,9 @@ class _TextError(Exception):
 
 
 def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
-    """Return the content of a YAML file.
+    """Return the content of a YAML file; `what` is its kind in messages, such as "a rig file".
 
-    Parameters
-    ----------
-    what : str
-        Kind of the file in messages, such as "a rig file".
-    error : type
-        Exception to raise.
-
-    Raises
-    ------
-    AqualvsError
-        Of type `error`; one line that names the file, the line in it and the remedy.
+    Raises `error` with one line that names the file, the line in it and the remedy.
     """
     return parse_yaml(read_text(path, what, error), str(path), error)
 
@@ -164,19 +154,9 @@ def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
 
 
 def parse_yaml(text: str, source: str, error: type[AqualvsError]) -> Any:
-    """Return the content of a YAML text.
+    """Return the content of a YAML text; `source` is its name in messages.
 
-    Parameters
-    ----------
-    source : str
-        Name of the text in messages.
-    error : type
-        Exception to raise.
-
-    Raises
-    ------
-    AqualvsError
-        Of type `error`; one line that names the source, the line in it and the remedy.
+    Raises `error` with one line that names the source, the line in it and the remedy.
     """
     try:
         return _parse(text)

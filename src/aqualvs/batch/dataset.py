@@ -39,23 +39,10 @@ def write_manifest(
     names: Sequence[str],
     place: Path | None = None,
 ) -> None:
-    """Declare files in a folder finished.
+    """Declare the files `names` finished, which are in `place`, or else in `folder`.
 
-    Parameters
-    ----------
-    key : str
-        What the files were made from.
-    facts : mapping
-        To be had back; ready for JSON.
-    names : sequence of str
-        The files, which are read for their checksums.
-    place : Path or None
-        Where the files are, if not in `folder`.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `key` says what they were made from. `facts`, ready for JSON, are kept with the checksums of the
+    files, which are read for them. Raises `OSError` as the system says it.
     """
     files = {name: _fingerprint((place or folder) / name) for name in names}
     content = {"key": key, "files": files, "facts": dict(facts)}
@@ -65,14 +52,7 @@ def write_manifest(
 def read_valid_manifest(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] | None:
     """Return the facts of finished work, None unless it is there, made for `key`, and intact.
 
-    Parameters
-    ----------
-    folder : Path
-        With the seal.
-    key : str
-        As in `write_manifest`.
-    place : Path or None
-        Where the files are, if not in `folder`.
+    `folder` has the seal; `key` and `place` are as in `write_manifest`.
     """
     content = read_manifest(folder)
     if content is None or content["key"] != key:
@@ -204,17 +184,7 @@ def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
 def put_net(dataset: Path, name: str, folder: Path) -> None:
     """Put the state of a dive's net into the data set, in place of what is there of this dive.
 
-    Parameters
-    ----------
-    name : str
-        Of the dive.
-    folder : Path
-        With `net.csv` and `holes.csv`.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `folder` holds `net.csv` and `holes.csv`. Raises `OSError` as the system says it.
     """
     for table in OF_NET:
         _put_table(dataset, name, folder / table, null_words=True)

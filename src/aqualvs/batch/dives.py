@@ -41,24 +41,14 @@ _LONGEST = 80
 def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) -> list[str]:
     """Return a unique name for every dive, also on file systems that ignore case.
 
-    Parameters
-    ----------
-    sources : sequence of (Path, str)
-        Where a dive is, and the name that the user gives it, if any. A dive without is named after
-        its file; where that is taken, with the folders before it, as many as it needs.
-    known : mapping
-        Source to the name that an earlier batch in the same folder gave it, and which stays.
+    They begin with a letter, so that no reader takes them for numbers or dates, and hold letters,
+    digits, dots, underscores and hyphens.
 
-    Returns
-    -------
-    names : list of str
-        They begin with a letter, so that no reader takes them for numbers or dates, and hold
-        letters, digits, dots, underscores and hyphens.
+    `sources`: where a dive is, and the name that the user gives it, if any. A dive without is named
+    after its file; where that is taken, with the folders before it, as many as it needs. `known`:
+    by source, the name that an earlier batch in the same folder gave it, and which stays.
 
-    Raises
-    ------
-    OptionError
-        If the user gives one name to two dives.
+    Raises `OptionError` if the user gives one name to two dives.
     """
     names = {
         str(path): known[str(path)]

@@ -252,22 +252,9 @@ def finished_dive(work: DiveWork, probe: DiveProbe) -> dict[str, Any] | None:
 def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
     """Join the pieces of a dive, write its report, and drop the pieces.
 
-    Parameters
-    ----------
-    results : sequence of PieceResult
-        Of all pieces, in order.
-
-    Returns
-    -------
-    facts : dict
-        Of the dive, for the summary; ready for JSON.
-
-    Raises
-    ------
-    PieceLostError
-        If a piece must be measured again.
-    AqualvsError
-        If the dive's folder cannot be written.
+    `results` are of all pieces, in order. Returns the facts of the dive, for the summary; ready for
+    JSON. Raises `PieceLostError` if a piece must be measured again, and `AqualvsError` if the
+    dive's folder cannot be written.
     """
     pieces = [piece_folder(work, probe, number) for number in range(len(probe.spans))]
     for number, piece in enumerate(pieces):

@@ -83,17 +83,9 @@ class WorkersGoneError(AqualvsError):
 class DaskWorkers(Closing):
     """Workers of a Dask scheduler; a context manager.
 
-    Parameters
-    ----------
-    n_workers : int or None
-        Processes on this machine, each with one thread; None for one per core.
-    scheduler : str or None
-        Address of a scheduler whose workers are used instead.
-
-    Raises
-    ------
-    OptionError
-        If `distributed` is missing, or the scheduler does not answer.
+    `n_workers`: processes on this machine, each with one thread; None for one per core.
+    `scheduler`: address of a scheduler whose workers are used instead. Raises `OptionError` if
+    `distributed` is missing, or the scheduler does not answer.
     """
 
     def __init__(self, n_workers: int | None = None, scheduler: str | None = None) -> None:
@@ -247,18 +239,9 @@ NET = "net"
 def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return a finished dive's facts with the condition of its net, evaluated now if it is wanted.
 
-    Parameters
-    ----------
-    key : str
-        Of the dive's result, `DiveProbe.key`.
-    facts : mapping
-        From `join_dive`.
-
-    Returns
-    -------
-    facts : dict
-        With `net`, as `net_dict` has it, where it is known, or with `net_fault`, which says why
-        not. The dive's own result stands in any case.
+    `key` is that of the dive's result, `DiveProbe.key`, and `facts` are from `join_dive`. Added is
+    `net`, as `net_dict` has it, where it is known, or `net_fault`, which says why not. The dive's
+    own result stands in any case.
     """
     request = work.request.net
     if request is None:
@@ -274,12 +257,7 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 def known_net(home: Path, key: str) -> dict[str, Any]:
     """Return the stored condition of a dive's net, as from `with_net`; empty if there is none.
 
-    Parameters
-    ----------
-    home : Path
-        Of the dive.
-    key : str
-        Of its result; what was told of another does not count.
+    `home` is the dive's, `key` its result's; what was told of another result does not count.
     """
     found = read_manifest(home / NET)
     if found is None or not str(found["key"]).startswith(f"{key}-"):
@@ -379,12 +357,8 @@ class Steps:
 class Scheduler:
     """Scheduler that measures many dives with many processes.
 
-    Parameters
-    ----------
-    works : sequence of (DiveWork, int)
-        The dives with the sizes of their sources in bytes, in the order in which they are begun.
-    steps : Steps, optional
-        In place of the real ones.
+    `works` are the dives with the sizes of their sources in bytes, in the order in which they are
+    begun, and `steps` stand in place of the real ones.
     """
 
     def __init__(
@@ -402,17 +376,9 @@ class Scheduler:
         self.records: dict[str, DiveRecord] = {}
 
     def run(self, is_stopped: Callable[[], bool]) -> dict[str, DiveRecord]:
-        """Work until all is done, or it is stopped.
+        """Work until all is done, or `is_stopped`, which is asked several times a second.
 
-        Parameters
-        ----------
-        is_stopped : callable
-            Asked several times a second.
-
-        Returns
-        -------
-        records : dict
-            Name to how the dive stands, of all dives.
+        Returns how all dives stand, by name.
         """
         for dive in self._dives:
             self._observer.expect(dive.n_bytes)

@@ -33,12 +33,7 @@ def range_steps(ranges: ArrayLike) -> list[float | None]:
 def range_svg(steps: Sequence[float | None], low: float, high: float) -> str:
     """Return the steps as a line in SVG; without a posture there is no line.
 
-    Parameters
-    ----------
-    steps : sequence of float or None
-        From `range_steps`.
-    low, high : float
-        Ranges at the picture's lower and upper edge, in metres.
+    `steps` are from `range_steps`; `low`, `high`: ranges at the picture's edges, in metres.
     """
     if not steps or not high > low:
         return ""
@@ -72,19 +67,9 @@ _EXAMPLES = {
 
 
 def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
-    """Write `summary.html`.
+    """Write `summary.html` of a batch's folder, the dives in the order of `records`.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the batch; reports are in `dives/NAME` below it.
-    records : sequence of DiveRecord
-        In the order of the page.
-
-    Raises
-    ------
-    OutputError
-        If the page cannot be written.
+    Reports are in `dives/NAME` below the folder. Raises `OutputError` if it cannot be written.
     """
     path = folder / SUMMARY_HTML
     text = _page(folder, records)

@@ -68,12 +68,8 @@ _MODES = {
 def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> Iterator[Finding]:
     """Wait for the heartbeat of an autopilot, listen for a while, and read its parameters.
 
-    Parameters
-    ----------
-    address : str
-        As in `parse_address`.
-    rig : Path or None
-        Rig file whose working range the autopilot's rangefinder should accept.
+    `address` is as in `parse_address`; `rig` is the file of a rig whose working range the
+    autopilot's rangefinder should accept.
     """
     working_range = None if rig is None else load_rig(rig).working_range
     with contextlib.closing(MavlinkLink(address, vehicle.link)) as link:

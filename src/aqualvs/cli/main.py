@@ -69,10 +69,7 @@ class LenientStream:
 def lenient_output() -> Iterator[LenientStream | None]:
     """Make standard output and error lenient, and able to write every character.
 
-    Yields
-    ------
-    output : LenientStream or None
-        Standard output; None if it is closed.
+    Yields standard output; None if it is closed.
     """
     before = sys.stdout, sys.stderr
     output = None if sys.stdout is None else _lenient(sys.stdout)

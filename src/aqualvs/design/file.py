@@ -224,21 +224,10 @@ def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict
 
 
 def design_from(content: object, *, name: str, folder: Path) -> Design:
-    """Return the design that the content of a design file describes.
+    """Return the design that the content of a design file, as read from YAML, describes.
 
-    Parameters
-    ----------
-    content : object
-        Content of the YAML file.
-    name : str
-        Name in messages.
-    folder : Path
-        Folder that the path of a rig file in it is relative to.
-
-    Raises
-    ------
-    OptionError, RigError
-        One line: file, place, value, remedy.
+    `name` stands in messages; the path of a rig file in it is relative to `folder`. Raises
+    `OptionError` or `RigError` with one line: file, place, value, remedy.
     """
     file = parse_settings(content, DesignFile, KEY, VERSION, name)
     try:

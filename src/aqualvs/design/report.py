@@ -303,21 +303,10 @@ _N_RANGES, _N_ALONG = 60, 40
 
 
 def draw_figures(design: Design, by_camera: Mapping[str, FloatArray], out: Path) -> list[Path]:
-    """Write `errors.png` and `picture.png`.
+    """Write `errors.png` and `picture.png` into a folder that exists.
 
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers.
-    by_camera : mapping from cause to array
-        From `camera_errors`, at `shown_ranges`; it changes little with range.
-    out : Path
-        Folder that exists.
-
-    Raises
-    ------
-    OSError
-        If a picture cannot be written.
+    `design` has the final tilts of its lasers; `by_camera` is from `camera_errors`, at
+    `shown_ranges`, and changes little with range. Raises `OSError` if a picture cannot be written.
     """
     from matplotlib import rc_context
 

@@ -85,17 +85,8 @@ def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, .
     """Return mounts evenly spaced around the forward axis, their stripes tangential to the circle.
 
     The first is below. Two are put below and beside, because opposite ones draw parallel stripes.
-
-    Parameters
-    ----------
-    count : int
-        Number of lasers.
-    baseline : float
-        Distance from the forward axis, metres.
-    back : float
-        Distance behind the dome's centre, metres.
-    fan : float
-        Full fan angle, radians.
+    The `baseline` is the distance from the forward axis, `back` that behind the dome's centre, in
+    metres; `fan` is the full fan angle in radians.
     """
     step = math.tau / count if count > 2 else math.pi / 2
     mounts = []
@@ -123,19 +114,9 @@ def tangential(position: Sequence[float]) -> float:
 def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     """Return a mount for a laser of a rig, with defaults for values that its plane does not give.
 
-    Parameters
-    ----------
-    laser : Laser
-        Behind a window the plane that fits its light best is used.
-    rig : Rig
-        The laser's rig.
-    fan : float
-        Full fan angle, radians.
-
-    Raises
-    ------
-    RigError
-        If the laser's sheet is square to the view, so that it draws no stripe.
+    Behind a window the plane that fits the laser's light best is used. `fan`: full fan angle,
+    radians. Raises `RigError` if the laser's sheet is square to the view, so that it draws no
+    stripe.
     """
     sheet = sheet_in(laser, rig.n_air, rig.n_water)
     plane = sheet.best_plane(rig.camera(), rig.working_range)

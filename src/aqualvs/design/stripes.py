@@ -68,14 +68,8 @@ def see_stripes(
 ) -> Stripes:
     """Return the sums over a camera's view of the stripes of K mounts on walls square ahead.
 
-    Parameters
-    ----------
-    ranges : array, shape (W,)
-        Metres.
-    common : array, shape (P, G)
-        G errors of the camera as steps of its parameters, see `parameter_names`.
-    margin : float
-        Width of the ignored border of the picture, in pixels.
+    `ranges`, shape (W,): metres. `common`, shape (P, G): G errors of the camera as steps of its
+    parameters, see `parameter_names`. `margin`: width of the picture's ignored border, in pixels.
     """
     axes = [mount.axes for mount in mounts]
     along, beam = (np.array([one[i] for one in axes]).reshape(-1, 3) for i in (0, 2))

@@ -14,10 +14,7 @@ U8Array: TypeAlias = NDArray[np.uint8]
 def as_vectors(values: ArrayLike, size: int, name: str) -> FloatArray:
     """Return `values` as a contiguous float64 array of shape (..., size).
 
-    Raises
-    ------
-    ValueError
-        If the last axis does not have length `size`; the message names `name` and the shape.
+    Raises `ValueError` with `name` and the shape, if the last axis does not have length `size`.
     """
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != size:

@@ -54,17 +54,10 @@ class ReplayedFrame(Frame):
 class Replay(Closing):
     """A recording that is measured again; both `FrameSource` and scanner of a run.
 
-    Parameters
-    ----------
-    request : RunRequest
-        Rig, water and the `chosen` options stand for the recorded ones; an overlay needs pictures
-        even if stripes are not looked for again.
-
-    Raises
-    ------
-    SourceError, RigError, OptionError
-        If the recording or the rig cannot be used, or the recording lacks the pictures that the
-        request needs.
+    Rig, water and the `chosen` options of the request stand for the recorded ones; an overlay needs
+    pictures even if stripes are not looked for again. Raises `SourceError`, `RigError` or
+    `OptionError` if the recording or the rig cannot be used, or the recording lacks the pictures
+    that the request needs.
     """
 
     def __init__(self, path: Path, request: RunRequest) -> None:
@@ -226,14 +219,8 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
 class DiveProcessor(Closing):
     """Measurement of a dive's frames; a context manager, within which processes measure.
 
-    Parameters
-    ----------
-    source : FrameSource or Replay
-        Open, and not yet read from.
-    window : FrameWindow
-        Of the frames to measure.
-    job : PoolJob or None
-        How processes may share the dive; None has this process measure it.
+    `source` is open, and not yet read from. `window` is that of the frames to measure, and `job`
+    how processes may share the dive; None has this process measure it.
     """
 
     def __init__(
@@ -312,19 +299,9 @@ _FIRST_FRAMES, _EVERY_S = 5, 0.4
 class WaterFollowingScanner:
     """Scanner that measures each frame in the water as tracked by the index target.
 
-    Parameters
-    ----------
-    rig : Rig
-        In the water to begin with.
-    target : Path
-        Markers on the vehicle (target.yaml).
-    water : Water
-        Temperature and salinity, if given, are a prior.
-
-    Raises
-    ------
-    CalibrationError
-        If the target's file cannot be used.
+    `rig` is in the water to begin with, and `target` holds the markers on the vehicle
+    (target.yaml). Temperature and salinity of `water`, if given, are a prior. Raises
+    `CalibrationError` if the target's file cannot be used.
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
