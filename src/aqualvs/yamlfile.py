@@ -399,8 +399,10 @@ def carry_comments(old: str, new: str) -> str:
         return new
     if len(comments) <= max_comments:
         carried = _carried(old, new, comments)
-        if _content(new) == _content(carried) and _holds(carried, comments):
-            return carried
+        if _content(new) == _content(carried):
+            found = "\n".join(one.text for one in _comments(carried))
+            if all(one.text in found for one in comments):
+                return carried
     lines = _BREAK.split(new)
     top = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return "\n".join([*lines[:top], *(one.text for one in comments), *lines[top:]])
@@ -411,11 +413,6 @@ def _content(text: str) -> str | None:
         return repr(parse_yaml(text, "", AqualvsError))
     except AqualvsError:
         return None
-
-
-def _holds(text: str, comments: list[_Comment]) -> bool:
-    found = "\n".join(one.text for one in _comments(text))
-    return all(one.text in found for one in comments)
 
 
 def _comments(text: str) -> list[_Comment]:
@@ -472,7 +469,11 @@ def _carried(old: str, new: str, comments: list[_Comment]) -> str:
     first: dict[_Place, int] = {}
     for line, _, place in _places(new):
         first.setdefault(place, line)
-    broken = _broken_lines(new)
+    # Lines that end within a value, in which # begins no comment.
+    broken: set[int] = set()
+    for token in yaml.scan(new, Loader=yaml.SafeLoader):
+        if isinstance(token, yaml.ScalarToken):
+            broken |= set(range(token.start_mark.line, token.end_mark.line))
     above: dict[int, list[str]] = {}
     behind: dict[int, list[str]] = {}
     for comment in comments:
@@ -492,15 +493,6 @@ def _carried(old: str, new: str, comments: list[_Comment]) -> str:
         result += [f"{indent}{one}" for one in above.get(number, [])]
         result.append("  ".join([text, *behind.get(number, [])]))
     return "\n".join(result)
-
-
-def _broken_lines(text: str) -> set[int]:
-    """Return the lines that end within a value, in which # begins no comment."""
-    found: set[int] = set()
-    for token in yaml.scan(text, Loader=yaml.SafeLoader):
-        if isinstance(token, yaml.ScalarToken):
-            found |= set(range(token.start_mark.line, token.end_mark.line))
-    return found
 
 
 def _owner(comment: _Comment, places: list[tuple[int, int, _Place]]) -> _Place | None:

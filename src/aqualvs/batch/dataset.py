@@ -201,8 +201,8 @@ def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
         parquet.write_table(table, draft, compression="zstd")
 
 
-def _table(path: Path, *, null_words: bool) -> Any:
-    """Return a CSV file as a table; numbers that are not there are null, and words if wanted."""
+def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> None:
+    """Put a CSV file into the data set; numbers that are not there are null, words if wanted."""
     with path.open(encoding="utf-8") as file:
         columns = file.readline().rstrip("\n").split(",")
     convert = csv.ConvertOptions(
@@ -214,12 +214,9 @@ def _table(path: Path, *, null_words: bool) -> Any:
     )
     # One thread: the process has one core to itself.
     read = csv.ReadOptions(use_threads=False)
-    return csv.read_csv(path, read_options=read, convert_options=convert)
-
-
-def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> None:
     with _replacing(_partition(dataset, name, path.name)) as draft:
-        parquet.write_table(_table(path, null_words=null_words), draft, compression="zstd")
+        table = csv.read_csv(path, read_options=read, convert_options=convert)
+        parquet.write_table(table, draft, compression="zstd")
 
 
 def holds(dataset: Path, name: str, tables: Iterable[str]) -> bool:

@@ -423,18 +423,16 @@ class Scheduler:
         if outcome.error is not None:
             self._handle_error(task.dive, outcome.error)
         elif (found := task.dive.probe) is None:
-            self._probed(task.dive, *outcome.value)
+            found, facts = outcome.value
+            self._expect(task.dive, found.n_bytes)
+            if facts is None:
+                self._measure(task.dive, found)
+            else:
+                self._finish(task.dive, facts, reused=True)
         elif task.piece is not None:
             self._measured(task.dive, found, task.piece, outcome.value)
         else:
             self._finish(task.dive, outcome.value, reused=False)
-
-    def _probed(self, dive: _Dive, found: DiveProbe, facts: dict[str, Any] | None) -> None:
-        self._expect(dive, found.n_bytes)
-        if facts is None:
-            self._measure(dive, found)
-        else:
-            self._finish(dive, facts, reused=True)
 
     def _measured(self, dive: _Dive, found: DiveProbe, piece: int, result: PieceResult) -> None:
         dive.results[piece] = result
@@ -457,7 +455,10 @@ class Scheduler:
         again = dive.n_attempts < max_attempts
         if isinstance(error, SpanMismatchError) and dive.probe is not None:
             if not dive.probe.is_whole:
-                return self._measure_whole(dive, dive.probe, str(error))
+                dive.n_attempts += 1
+                dive.results.clear()
+                self._expect(dive, dive.probe.n_bytes)
+                return self._measure(dive, dive.probe.in_one_piece(str(error)))
         elif isinstance(error, PieceLostError | WorkersLostError) and again:
             dive.probe = None
             return self._start(dive)
@@ -465,13 +466,6 @@ class Scheduler:
         words = str(error) if foreseen else f"{type(error).__name__}: {error}"
         drop(dive.work.dataset, dive.work.name, (*OF_DIVE, *OF_NET))
         return self._end(dive, _record(dive, DiveState.FAILED, words))
-
-    def _measure_whole(self, dive: _Dive, found: DiveProbe, why: str) -> None:
-        """Measure a dive in one piece after its pieces turned out to be unusable."""
-        dive.n_attempts += 1
-        dive.results.clear()
-        self._expect(dive, found.n_bytes)
-        self._measure(dive, found.in_one_piece(why))
 
     def _finish(self, dive: _Dive, facts: Mapping[str, Any], *, reused: bool) -> None:
         work = dive.work

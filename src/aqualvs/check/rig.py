@@ -223,14 +223,6 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
     return _angle(rays, 0, 1), _angle(rays, 2, 3)
 
 
-def blind_fraction(camera: Camera) -> float:
-    """Return the fraction of pixels, on a grid, that see nothing of the outer medium."""
-    width, height = camera.size_px
-    x, y = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33))
-    rays = camera.rays(np.stack([x, y], axis=-1))
-    return float(np.mean(~rays.valid))
-
-
 def _angle(rays: Rays, first: int, second: int) -> float:
     cosine = float(rays.directions[first] @ rays.directions[second])
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -339,7 +331,9 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
             "measured against the dome's axes."
         )
     across, down = (math.degrees(angle) for angle in field_of_view(camera))
-    blind = blind_fraction(camera)
+    # Share of pixels, on a grid, that see nothing of the outer medium.
+    grid = np.meshgrid(*(np.linspace(0, side - 1, 33) for side in rig.size_px))
+    blind = float(np.mean(~camera.rays(np.stack(grid, axis=-1)).valid))
     if math.isnan(across) or math.isnan(down) or blind > 0.0:
         yield Finding.warn(
             f"{blind:.0%} of the picture sees no water: the lens model ends or "

@@ -264,16 +264,11 @@ def _check(value: Any, name: str) -> None:
         raise OptionError(f"{name} {value:g}: give a finite number")
     if isinstance(value, int) and abs(value) > max_integer:
         raise OptionError(f"{name} {value}: too large; give a number up to {max_integer}")
-    if isinstance(value, str | Path) and not _is_text(str(value)):
-        raise OptionError(f"{name} {str(value)!r}: not UTF-8; rename it")
+    if isinstance(value, str | Path):
+        try:
+            # Python decodes other bytes as surrogates.
+            str(value).encode()
+        except UnicodeEncodeError:
+            raise OptionError(f"{name} {str(value)!r}: not UTF-8; rename it") from None
     if isinstance(value, Path):
         refuse_special(value, OptionError)
-
-
-def _is_text(value: str) -> bool:
-    """Return whether a text can be encoded as UTF-8; Python decodes other bytes as surrogates."""
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True

@@ -84,14 +84,6 @@ def lenient_output() -> Iterator[LenientStream | None]:
         sys.stdout, sys.stderr = before
 
 
-def drop_output() -> None:
-    """Redirect standard output to the null device, so that the last flush at exit succeeds."""
-    with contextlib.suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
-
-
 def _lenient(stream: TextIO) -> LenientStream:
     # Characters that the terminal's encoding lacks must not raise.
     reconfigure = getattr(stream, "reconfigure", None)
@@ -321,7 +313,11 @@ def _complete(code: int, output: LenientStream | None, *, ends: bool) -> int:
     if fault is None:
         return code
     if ends:
-        drop_output()
+        # So that the last flush at exit succeeds.
+        with contextlib.suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
     if fault.errno == errno.EPIPE:
         return code or _EXIT_BROKEN_PIPE
     return _complain(f"standard output: cannot be written ({fault.strerror})", _EXIT_BAD_INPUT)

@@ -140,11 +140,6 @@ def parameter_names(camera: "Camera") -> tuple[str, ...]:
     return POSE_PARAMETERS + camera.params.port.names + camera.lens.parameter_names
 
 
-def _check_size(size_px: tuple[int, int]) -> None:
-    if len(size_px) != 2 or not all(side > 0 for side in size_px):
-        raise RigError(f"camera has size {size_px} px; width and height must be positive")
-
-
 def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
     rotation = np.asarray(pose.rotation, dtype=np.float64)
     centre = np.asarray(pose.translation, dtype=np.float64)
@@ -186,7 +181,9 @@ class Camera:
     """Packed numbers for compiled kernels."""
 
     def __post_init__(self) -> None:
-        _check_size(self.size_px)
+        if len(self.size_px) != 2 or not all(side > 0 for side in self.size_px):
+            size = self.size_px
+            raise RigError(f"camera has size {size} px; width and height must be positive")
         check_index("camera", "n_air", self.n_air)
         check_index("camera", "n_water", self.n_water)
         rotation, centre = _checked_pose(self.dome_from_cam)

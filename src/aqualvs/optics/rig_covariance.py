@@ -196,20 +196,16 @@ def _derivatives_on_lattice(rig: Rig, steps: dict[str, float]) -> _Lattice:
         by_direction = (ahead.directions - behind.directions) / (2.0 * h)
         rows.append(np.concatenate([by_origin, by_direction], axis=-1))
     table = np.stack(rows, axis=1)
-    _fill_blind(table, pixels)
-    scale = np.array([(n_x - 1) / (width - 1), (n_y - 1) / (height - 1)])
-    return _Lattice(np.ascontiguousarray(table.reshape(n_y, n_x, -1, 6)), scale)
-
-
-def _fill_blind(table: FloatArray, pixels: FloatArray) -> None:
-    """Give nodes without a ray the values of the nearest one that has a ray."""
     seen = np.isfinite(table).all(axis=(1, 2))
     if not seen.any():
         table[:] = 0.0
-        return
-    for i in np.flatnonzero(~seen):
-        nearest = np.argmin(np.sum((pixels[seen] - pixels[i]) ** 2, axis=-1))
-        table[i] = table[np.flatnonzero(seen)[nearest]]
+    else:
+        # Nodes without a ray get the values of the nearest one that has a ray.
+        for i in np.flatnonzero(~seen):
+            nearest = np.argmin(np.sum((pixels[seen] - pixels[i]) ** 2, axis=-1))
+            table[i] = table[np.flatnonzero(seen)[nearest]]
+    scale = np.array([(n_x - 1) / (width - 1), (n_y - 1) / (height - 1)])
+    return _Lattice(np.ascontiguousarray(table.reshape(n_y, n_x, -1, 6)), scale)
 
 
 def _sheet_moves(rig: Rig, camera: Camera, steps: dict[str, float]) -> _SheetMoves:

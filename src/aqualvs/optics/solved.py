@@ -383,8 +383,13 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
 
     Raises `RigError` as `rig_uncertainty` does.
     """
-    known = set(rig_uncertainty(rig).names)
-    return tuple(one for one in _defaults(rig) if known.isdisjoint(_settled_by(one)))
+    known, found = set(rig_uncertainty(rig).names), []
+    for one in _defaults(rig):
+        names = one.uncertainty.names
+        # The calibration of the dome decides which of its sizes are uncertain.
+        if known.isdisjoint((*names, *_LENS) if names[0] in _SHELL else names):
+            found.append(one)
+    return tuple(found)
 
 
 def completed_uncertainty(rig: Rig) -> RigUncertainty:
@@ -401,13 +406,6 @@ def completed_uncertainty(rig: Rig) -> RigUncertainty:
         covariance[first:stop, first:stop] = part.covariance
         first = stop
     return RigUncertainty(names, covariance)
-
-
-def _settled_by(one: Assumption) -> tuple[str, ...]:
-    """Return the numbers any of which shows that the group was calibrated."""
-    names = one.uncertainty.names
-    # The calibration of the dome decides which of its sizes are uncertain.
-    return (*names, *_LENS) if names[0] in _SHELL else names
 
 
 def _defaults(rig: Rig) -> Iterator[Assumption]:
