@@ -212,7 +212,11 @@ class FrameScanner(Protocol):
 
 @runtime_checkable
 class RecordableScanner(FrameScanner, Protocol):
-    """Interface of a scanner that also returns what it computes its scans from."""
+    """Base of scanners that also return what they compute their scans from."""
+
+    def process(self, frame: Frame) -> Scan:
+        """Return the scan of one frame."""
+        return self.process_with_inputs(frame)[0]
 
     def process_with_inputs(self, frame: Frame) -> tuple[Scan, ScanInputs]:
         """Return the scan of one frame, and its inputs."""
