@@ -298,7 +298,8 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
                 f"a bare lens: {held.bare_rms_px:.2f} px",
             )
         )
-    port_names = [name for name in rig.camera().params.port.names if name in sigmas]
+    housing = () if rig.housing is None else rig.housing.parameter_names
+    port_names = [name for name in housing if name in sigmas]
     what = "dome" if rig.flat_port is None else "flat port"
     return CalibrationPage(
         title=f"Calibration of the {what}",

@@ -50,11 +50,6 @@ class BareParams(NamedTuple):
 
     centre: Vec  # The lens position L in `dome`, metres.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return ()
-
 
 @inline_kernel
 def _trace_bare(
@@ -137,7 +132,8 @@ def parameter_names(camera: "Camera") -> tuple[str, ...]:
     then the intrinsics: fx, fy, cx, cy and as many distortion coefficients as the lens has, in
     OpenCV's order.
     """
-    return POSE_PARAMETERS + camera.params.port.names + camera.lens.parameter_names
+    port = () if camera.housing is None else camera.housing.parameter_names
+    return POSE_PARAMETERS + port + camera.lens.parameter_names
 
 
 def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
@@ -295,7 +291,7 @@ class Camera:
             valid.reshape(-1),
             by_point.reshape(-1, 2, 3),
             by_parameter,
-            len(POSE_PARAMETERS) + len(self.params.port.names),
+            len(parameter_names(self)) - len(self.lens.parameter_names),
         )
         return pixels, valid, by_point
 
