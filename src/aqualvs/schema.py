@@ -72,9 +72,7 @@ class SchemaWords:
         """Return one line on the fault to mend first; a misspelt key explains the missing one."""
         faults = error.errors(include_url=False)
         unknown = [fault for fault in faults if fault["type"] in ("extra_forbidden", "invalid_key")]
-        return self._sentence((unknown or faults)[0], model)
-
-    def _sentence(self, fault: ErrorDetails, model: type[BaseModel]) -> str:
+        fault = (unknown or faults)[0]
         place, kind = _place(fault["loc"]) or "the file", fault["type"]
         if kind == "extra_forbidden":
             return f"{place} is not a key of {self.file}; {_closest(fault['loc'], model)}"
@@ -86,10 +84,7 @@ class SchemaWords:
             )
         if kind == "missing":
             return self.missing(place, fault["loc"])
-        remedy = self._remedy(fault)
-        if kind == "literal_error":
-            remedy = f"write {fault['ctx']['expected']}"
-        return f"{place} is {shown(fault['input'])}; {remedy}"
+        return f"{place} is {shown(fault['input'])}; {self._remedy(fault)}"
 
     def missing(self, place: str, loc: tuple[int | str, ...]) -> str:
         """Return the sentence on a key that must be there."""
@@ -97,6 +92,8 @@ class SchemaWords:
 
     def _remedy(self, fault: ErrorDetails) -> str:
         kind, place = fault["type"], fault["loc"]
+        if kind == "literal_error":
+            return f"write {fault['ctx']['expected']}"
         ends = str(place[0]) if place else "", str(place[-1]) if place else ""
         if ends in self.remedies:
             return self.remedies[ends]

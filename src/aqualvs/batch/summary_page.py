@@ -83,6 +83,12 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
     low, high = (min(ranges), max(ranges)) if ranges else (0.0, 0.0)
     lead = "Ranges over time share one scale"
     lead += f", {low:.2f} to {high:.2f} m; a gap is a stretch without a posture." if ranges else "."
+
+    def address(record: DiveRecord, file: str) -> str:
+        """Return the address of a file of a dive; empty if it is not there."""
+        place = Path("dives") / record.name / file
+        return quote(place.as_posix()) if (folder / place).is_file() else ""
+
     content = {
         "title": folder.resolve().name,
         "subtitle": _rigs(records),
@@ -93,7 +99,7 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
         "records": records,
         "with_net": any(record.net for record in records),
         "clock": clock,
-        "address": lambda record, file: _address(folder, record, file),
+        "address": address,
         "range_svg": lambda steps: html.Raw(range_svg(steps, low, high)),
         "examples": _EXAMPLES,
     }
@@ -146,9 +152,3 @@ def _notes_on(record: DiveRecord) -> Iterator[str]:
         n, largest = record.net["n_holes"], record.net["largest_hole_mm"]
         found = "1 hole" if n == 1 else f"{n} holes, the largest"
         yield f"{record.name}: the net has {found} of {largest:.0f} mm"
-
-
-def _address(folder: Path, record: DiveRecord, file: str) -> str:
-    """Return the address of a file of a dive; empty if it is not there."""
-    place = Path("dives") / record.name / file
-    return quote(place.as_posix()) if (folder / place).is_file() else ""

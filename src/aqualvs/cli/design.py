@@ -68,13 +68,13 @@ def design(
         },
         "dome": _numbers(dome_mm, ":", ("inner_radius_mm", "thickness_mm"), "--dome-mm"),
         "flat": _numbers(flat_mm, ":", ("distance_mm", "thickness_mm"), "--flat-mm"),
-        "lens": _listed(lens_mm, ",", "position_mm", 3, "--lens-mm"),
+        "lens": {"position_mm": _split(lens_mm, ",", 3, "--lens-mm") or None},
         "lasers": {
             "count": lasers,
             "baseline_mm": baseline_mm,
             "fan_deg": None if rig else fan_deg,
         },
-        **_listed(range_mm, ":", "working_range_mm", 2, "--range-mm"),
+        "working_range_mm": _split(range_mm, ":", 2, "--range-mm"),
     }
     request = command.DesignRequest(
         design=file,
@@ -105,12 +105,6 @@ def _numbers(text: str | None, between: str, names: tuple[str, ...], option: str
     """Return the numbers of an option such as 1920x1080 by their names; empty if not given."""
     found = _split(text, between, len(names), option)
     return dict(zip(names, found, strict=False))
-
-
-def _listed(text: str | None, between: str, name: str, count: int, option: str) -> dict[str, Any]:
-    """Return the numbers of an option such as 300:1200 as one named list; empty if not given."""
-    found = _split(text, between, count, option)
-    return {name: found} if found else {}
 
 
 def _split(text: str | None, between: str, count: int, option: str) -> list[float | int]:

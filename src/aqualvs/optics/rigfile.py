@@ -6,6 +6,7 @@ is kept under its date in UTC, such as `rig.2026-11-23T141503.yaml` (`keep_dated
 explains every key.
 """
 
+import contextlib
 import math
 import os
 import re
@@ -52,27 +53,29 @@ def keep_dated(path: Path, now: datetime | None = None) -> Path:
     copied.
     """
     stamp = (now or datetime.now(UTC)).astimezone(UTC).strftime("%Y-%m-%dT%H%M%S")
-    number = 1
-    while True:
-        again = f"-{number}" if number > 1 else ""
-        copy = path.with_name(f"{path.stem}.{stamp}{again}{path.suffix}")
-        number += 1
-        try:
-            content = path.read_bytes()
-            file = copy.open("xb")
-        except FileExistsError:
-            continue
-        except OSError as fault:
-            raise _uncopied(path, fault) from fault
+    number, file = 1, None
+    try:
+        content = path.read_bytes()
+        while file is None:
+            again = f"-{number}" if number > 1 else ""
+            copy = path.with_name(f"{path.stem}.{stamp}{again}{path.suffix}")
+            number += 1
+            with contextlib.suppress(FileExistsError):
+                file = copy.open("xb")
         try:
             with file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-        except OSError as fault:
+        except OSError:
             copy.unlink(missing_ok=True)
-            raise _uncopied(path, fault) from fault
-        return copy
+            raise
+    except OSError as fault:
+        raise OutputError(
+            f"{path}: cannot be kept as a dated copy ({fault.strerror}), so it is not replaced; "
+            "free the disk or choose another place"
+        ) from fault
+    return copy
 
 
 def dated_copies(path: Path) -> list[Path]:
@@ -84,13 +87,6 @@ def dated_copies(path: Path) -> list[Path]:
         if stamp is not None and copy.name == f"{path.stem}{middle}{path.suffix}":
             found.append((stamp[1], int(stamp[2] or 1), copy))
     return [copy for _, _, copy in sorted(found, reverse=True)]
-
-
-def _uncopied(path: Path, fault: OSError) -> OutputError:
-    return OutputError(
-        f"{path}: cannot be kept as a dated copy ({fault.strerror}), so it is not replaced; free "
-        "the disk or choose another place"
-    )
 
 
 _MILLI = 1e3
