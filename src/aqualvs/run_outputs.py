@@ -105,17 +105,6 @@ def _rerun(path: Path, rig: Rig) -> Iterator[WriteResult]:
         yield lambda one: log.write(_sample(0, one.scan, ScanInputs(rig, {}), one.frame))
 
 
-def check_source_stays(folder: Path, source: str) -> None:
-    """Make sure that a run does not replace its own source.
-
-    Raises `OptionError` if the run's own source would be replaced.
-    """
-    path = Path(source)
-    is_ours = path.is_file() and path.name in RUN_FILES
-    if is_ours and path.resolve().parent == folder.resolve():
-        raise OptionError(f"{path}: is what the run reads; write to another folder")
-
-
 @contextmanager
 def _overlay(request: RunRequest, rig: Rig, source: FrameSource) -> Iterator[WriteResult]:
     """Write `overlay.mp4`; a lost frame gives a black picture, so that frames keep their number.
@@ -195,24 +184,24 @@ def claim_outputs(request: RunRequest) -> ExitStack:
     """Make sure that the run can be written, and return its claims, to be closed at its end.
 
     Raises `OutputError` if it cannot, or its folder holds another that may not be replaced. Raises
-    `OptionError` if a file of Rerun is requested but cannot be.
+    `OptionError` if its own source would be replaced, or a file of Rerun is requested but cannot be
+    written.
     """
-    check_source_stays(request.out, request.source)
+    source, rerun = Path(request.source), request.rerun
+    is_ours = source.is_file() and source.name in RUN_FILES
+    if is_ours and source.resolve().parent == request.out.resolve():
+        raise OptionError(f"{source}: is what the run reads; write to another folder")
     with ExitStack() as claims:
-        if request.rerun is not None:
-            claims.callback(_claim_rerun(request.rerun, overwrite=request.overwrite).close)
+        if rerun is not None:
+            from aqualvs.recording.rerun_log import RRD, rerun_sdk
+
+            if rerun.suffix != RRD:
+                raise OptionError(f"--rerun {rerun}: give a file that ends in {RRD}")
+            rerun_sdk()
+            refuse_special(rerun, OutputError, f"give a file that ends in {RRD}")
+            claims.callback(Claim("run", [rerun], overwrite=request.overwrite).close)
         claims.callback(prepare_folder(request.out, overwrite=request.overwrite).close)
         return claims.pop_all()
-
-
-def _claim_rerun(path: Path, *, overwrite: bool) -> Claim:
-    from aqualvs.recording.rerun_log import RRD, rerun_sdk
-
-    if path.suffix != RRD:
-        raise OptionError(f"--rerun {path}: give a file that ends in {RRD}")
-    rerun_sdk()
-    refuse_special(path, OutputError, f"give a file that ends in {RRD}")
-    return Claim("run", [path], overwrite=overwrite)
 
 
 @contextmanager

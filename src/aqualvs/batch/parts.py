@@ -316,24 +316,21 @@ def _join_files(pieces: Sequence[Path], folder: Path) -> None:
     """Write rows and points of all pieces as those of one run."""
     for name in (POSTURE_CSV, POSTURE_BARE_CSV):
         parts = [piece / name for piece in pieces if (piece / name).exists()]
-        if parts:
-            _join_rows(parts, folder / name)
+        if not parts:
+            continue
+        # Rows of all under the head of the first.
+        with (folder / name).open("wb") as whole:
+            for number, part in enumerate(parts):
+                with part.open("rb") as rows:
+                    head = rows.readline()
+                    if number == 0:
+                        whole.write(head)
+                    shutil.copyfileobj(rows, whole)
     export_points(
         (batch for piece in pieces for batch in read_points_stream(piece / POINTS_STREAM)),
         folder / POINTS_PARQUET,
         folder / POINTS_PLY,
     )
-
-
-def _join_rows(parts: Sequence[Path], path: Path) -> None:
-    """Write the rows of several CSV files under the head of the first."""
-    with path.open("wb") as whole:
-        for number, part in enumerate(parts):
-            with part.open("rb") as rows:
-                head = rows.readline()
-                if number == 0:
-                    whole.write(head)
-                shutil.copyfileobj(rows, whole)
 
 
 def _replace_run(draft: Path, out: Path) -> list[str]:

@@ -9,6 +9,7 @@ Where the condition of the net is wanted, it is evaluated from the finished run 
 something that it depends on changes.
 """
 
+import importlib
 import logging
 import os
 import queue
@@ -89,7 +90,12 @@ class DaskWorkers(Closing):
     """
 
     def __init__(self, n_workers: int | None = None, scheduler: str | None = None) -> None:
-        distributed = _distributed()
+        try:
+            distributed: Any = importlib.import_module("distributed")
+        except ImportError as fault:
+            raise OptionError(
+                "aqualvs batch needs distributed; install it with pip install 'aqualvs[batch]'"
+            ) from fault
         self._killed: type[BaseException] = distributed.KilledWorker
         self._n_slots, self._count_again_s, self._seen_s = 1, 0.0, time.monotonic()
         self._ended: queue.SimpleQueue[tuple[object, Any]] = queue.SimpleQueue()
@@ -179,16 +185,6 @@ class DaskWorkers(Closing):
         self._client.close()
         if self._cluster is not None:
             self._cluster.close(timeout=_TIMEOUT_S)
-
-
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError as fault:
-        raise OptionError(
-            "aqualvs batch needs distributed; install it with pip install 'aqualvs[batch]'"
-        ) from fault
-    return distributed
 
 
 def _local_cluster(distributed: Any, n_workers: int | None) -> Any:

@@ -83,6 +83,11 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
     low, high = (min(ranges), max(ranges)) if ranges else (0.0, 0.0)
     lead = "Ranges over time share one scale"
     lead += f", {low:.2f} to {high:.2f} m; a gap is a stretch without a posture." if ranges else "."
+    notes = [note for record in records for note in _notes_on(record)]
+    max_notes = 12
+    if len(notes) > max_notes:
+        more = f"and {len(notes) - max_notes} more, in the table and in the dives’ own reports"
+        notes = [*notes[:max_notes], more]
 
     def address(record: DiveRecord, file: str) -> str:
         """Return the address of a file of a dive; empty if it is not there."""
@@ -93,7 +98,7 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
         "title": folder.resolve().name,
         "subtitle": _rigs(records),
         "cards": html.cards(_cards(records)),
-        "warnings": html.notice(list(_notes(records))),
+        "warnings": html.notice(notes),
         "lead": lead,
         "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
         "records": records,
@@ -129,15 +134,6 @@ def _cards(records: Sequence[DiveRecord]) -> list[Card]:
         Card("Recorded", clock(seconds), count_text(n_frames, "frame", commas=True)),
         Card("Frames with a posture", share, f"{n_valid:,} of {n_frames:,}"),
     ]
-
-
-def _notes(records: Sequence[DiveRecord]) -> Iterator[str]:
-    """Yield the points that deserve attention, dive by dive, up to a readable number."""
-    notes = [note for record in records for note in _notes_on(record)]
-    max_notes = 12
-    yield from notes[:max_notes]
-    if len(notes) > max_notes:
-        yield f"and {len(notes) - max_notes} more, in the table and in the dives’ own reports"
 
 
 def _notes_on(record: DiveRecord) -> Iterator[str]:

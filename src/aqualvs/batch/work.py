@@ -175,19 +175,15 @@ def _content(dive: OpenDive, piece_frames: int, margin: int) -> dict[str, Any]:
             "n_bytes": video.n_bytes,
         }
     if isinstance(pictures, ImageSource) and path.is_dir():
-        return _images(path, piece_frames, margin)
+        files = [(image.name, image.stat()) for image in images_in(path)]
+        sizes = [stat.st_size for _, stat in files]
+        return {
+            "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
+            "spans": [asdict(span) for span in image_spans(sizes, piece_frames, margin)],
+            "why_whole": "",
+            "n_bytes": sum(sizes),
+        }
     return _uncut(path, "recordings and bags are not split")
-
-
-def _images(folder: Path, piece_frames: int, margin: int) -> dict[str, Any]:
-    files = [(path.name, path.stat()) for path in images_in(folder)]
-    sizes = [stat.st_size for _, stat in files]
-    return {
-        "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
-        "spans": [asdict(span) for span in image_spans(sizes, piece_frames, margin)],
-        "why_whole": "",
-        "n_bytes": sum(sizes),
-    }
 
 
 def _uncut(path: Path, why: str) -> dict[str, Any]:

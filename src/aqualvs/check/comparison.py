@@ -326,7 +326,14 @@ def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[Compar
         )
     if old.housing is not None and type(new.housing) is type(old.housing):
         parts += _housing_parts(old.housing, difference)
-    return parts + [_laser_part(new, a, b, difference) for a, b in _shared_lasers(new, old)]
+    for ours, theirs in _shared_lasers(new, old):
+        angle, shift, _ = _laser_move(new, ours, theirs, difference)
+        turned, moved = f"{math.degrees(angle):.2g} deg", f"{abs(shift) * 1e3:.2g} mm"
+        name, names = f"laser '{theirs.name}'", laser_parameter_names(theirs)[:3]
+        change = f"moved by {turned}, {moved} at {_WALL_M:g} m"
+        matters = angle > _TILT or abs(shift) > _SHIFT_M
+        parts.append(_part(difference, name, names, change, matters))
+    return parts
 
 
 def verdict(parts: list[ComparedPart]) -> str:
@@ -410,14 +417,6 @@ def _housing_parts(housing: Housing, difference: RigDifference) -> Iterator[Comp
     step = difference.of("n_water")
     change = f"changed its index by {step:+.4f}"
     yield _part(difference, "the water", ("n_water",), change, abs(step) > _INDEX)
-
-
-def _laser_part(new_rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> ComparedPart:
-    names = laser_parameter_names(old)[:3]
-    angle, shift, _ = _laser_move(new_rig, new, old, difference)
-    change = f"moved by {math.degrees(angle):.2g} deg, {abs(shift) * 1e3:.2g} mm at {_WALL_M:g} m"
-    matters = angle > _TILT or abs(shift) > _SHIFT_M
-    return _part(difference, f"laser '{old.name}'", names, change, matters)
 
 
 def _part(
@@ -547,23 +546,20 @@ def _change_cells(change: float, sigma: float) -> list[str]:
 def _laser_rows(rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> Iterator[list[str]]:
     angle, shift, sigma = _laser_move(rig, new, old, difference)
     label = escaped(old.name)
+    # The sigma of a rotation in the direction in which the laser has turned.
+    rows = [difference.names.index(name) for name in laser_parameter_names(old)[:2]]
+    tilt = difference.change[rows]
+    length, turned_sigma = float(np.linalg.norm(tilt)), 0.0
+    if length:
+        variance = float(tilt @ difference.covariance[np.ix_(rows, rows)] @ tilt)
+        turned_sigma = math.sqrt(variance) / length
     turn = [f"{label} turned by deg", "", ""]
-    yield turn + _change_cells(math.degrees(angle), math.degrees(_tilt_sigma(old, difference)))
+    yield turn + _change_cells(math.degrees(angle), math.degrees(turned_sigma))
     if math.isfinite(shift):
         moved = [f"{label} off at {_WALL_M:g} m by mm", "", ""]
         # Points that have not moved differ by rounding.
         shift = 0.0 if abs(shift) < 1e-12 else shift
         yield moved + _change_cells(shift * 1e3, sigma * 1e3)
-
-
-def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
-    """Return the sigma of a laser's rotation in the direction in which it has turned."""
-    rows = [difference.names.index(name) for name in laser_parameter_names(laser)[:2]]
-    tilt = difference.change[rows]
-    length = float(np.linalg.norm(tilt))
-    if length == 0.0:
-        return 0.0
-    return math.sqrt(float(tilt @ difference.covariance[np.ix_(rows, rows)] @ tilt)) / length
 
 
 def _degrees(angle: float) -> str:

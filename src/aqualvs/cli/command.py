@@ -144,24 +144,20 @@ class CheckedCommand(TyperCommand):
         Raises `OptionError` with the option.
         """
         try:
-            self._refuse_empty(ctx, args)
+            if any(word == "" or word.endswith("=") for word in args):
+                found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
+                for parameter in self.params:
+                    if any(value == "" for value in _flattened(found.get(parameter.name))):
+                        raise OptionError(
+                            f"{_name(parameter)} '': is empty; give a value, or set the variable "
+                            "of the shell that should hold it"
+                        )
             return super().parse_args(ctx, args)
         except USAGE_ERROR as fault:
             # The parser leaves out the command if the value of an option is missing.
             if getattr(fault, "ctx", None) is None:
                 vars(fault)["ctx"] = ctx
             raise
-
-    def _refuse_empty(self, ctx: Any, args: Sequence[str]) -> None:
-        """Raise `OptionError` for an empty argument or value of an option."""
-        if any(word == "" or word.endswith("=") for word in args):
-            found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
-            for parameter in self.params:
-                if any(value == "" for value in _flattened(found.get(parameter.name))):
-                    raise OptionError(
-                        f"{_name(parameter)} '': is empty; give a value, or set the variable of "
-                        "the shell that should hold it"
-                    )
 
     def invoke(self, ctx: Any) -> Any:
         """Check the values and run the command.
