@@ -9,7 +9,7 @@ Changes: each one is tried with the lasers' angles optimised again (`changes`).
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -175,12 +175,9 @@ def _for_mounts(design: Design, change: Callable[[Mount], Mount]) -> Design:
     return design.with_mounts([change(mount) for mount in design.mounts])
 
 
-def _wider_baseline(design: Design) -> Design:
-    def move(mount: Mount) -> Mount:
-        x, y, z = mount.position
-        return replace(mount, position=(1.2 * x, y, 1.2 * z))
-
-    return _for_mounts(design, move)
+def _moved_out(mount: Mount) -> Mount:
+    x, y, z = mount.position
+    return replace(mount, position=(1.2 * x, y, 1.2 * z))
 
 
 def _finer(design: Design) -> Design:
@@ -206,22 +203,16 @@ def _one_more(design: Design) -> Design | None:
     names = {mount.name for mount in design.mounts}
     name = next(name for name in (f"extra_{i}" for i in range(1, 99)) if name not in names)
     tilt, fan = design.mounts[0].tilt, design.mounts[0].fan
-    added = [
-        Mount(name=name, position=place, stripe=tangential(place), tilt=tilt, fan=fan)
-        for place in _free_places(design)
-    ]
-    tried = (best_angles(design.with_mounts([*design.mounts, one]), quick=True) for one in added)
-    return min(tried, key=lambda one: score(one).total, default=None)
-
-
-def _free_places(design: Design) -> Iterator[tuple[float, float, float]]:
     places = [mount.position for mount in design.mounts]
     # Least distance between lasers, in metres.
     room = 0.03
-    for x, y, z in places:
-        across = (-x, y, -z)
-        if all(math.dist(across, other) > room for other in places):
-            yield across
+    added = [
+        Mount(name=name, position=place, stripe=tangential(place), tilt=tilt, fan=fan)
+        for place in ((-x, y, -z) for x, y, z in places)
+        if all(math.dist(place, other) > room for other in places)
+    ]
+    tried = (best_angles(design.with_mounts([*design.mounts, one]), quick=True) for one in added)
+    return min(tried, key=lambda one: score(one).total, default=None)
 
 
 def _turned(design: Design) -> Design | None:
@@ -264,7 +255,7 @@ def _nearer(design: Design) -> Design | None:
 
 
 _CHANGES: dict[str, Callable[[Design], Design | None]] = {
-    "baseline 20 % longer": _wider_baseline,
+    "baseline 20 % longer": lambda design: _for_mounts(design, _moved_out),
     "twice the pixels, each way": _finer,
     "focal length 25 % longer": _longer_lens(1.25),
     "focal length 20 % shorter": _longer_lens(0.8),

@@ -269,12 +269,21 @@ def _design(file: DesignFile, folder: Path) -> Design:
         shutter=shutter,
     )
     rig.camera()
+    tolerances = file.tolerances
     return Design(
         rig=rig,
         mounts=_mounts(file),
         centring=file.lens.centring_mm / _MM,
         noise=Noise(**si_values(file.noise)),
-        tolerances=_tolerances(file.tolerances),
+        tolerances=Tolerances(
+            lens=tolerances.lens_mm / _MM,
+            rotation=math.radians(tolerances.rotation_deg),
+            focal=tolerances.focal_percent / 100.0,
+            dome=tolerances.dome_mm / _MM,
+            n_water=tolerances.n_water,
+            laser_angle=math.radians(tolerances.laser_deg),
+            laser_offset=tolerances.laser_mm / _MM,
+        ),
         net=NominalNet(**si_values(file.net)),
         goals=Goals(
             range_share=file.goals.range_percent / 100.0, angle=math.radians(file.goals.angle_deg)
@@ -346,16 +355,4 @@ def _mount(part: MountPart) -> Mount:
         fan=math.radians(part.fan_deg),
         free_tilt=part.tilt_deg is None,
         free_stripe=given == "best",
-    )
-
-
-def _tolerances(part: TolerancesPart) -> Tolerances:
-    return Tolerances(
-        lens=part.lens_mm / _MM,
-        rotation=math.radians(part.rotation_deg),
-        focal=part.focal_percent / 100.0,
-        dome=part.dome_mm / _MM,
-        n_water=part.n_water,
-        laser_angle=math.radians(part.laser_deg),
-        laser_offset=part.laser_mm / _MM,
     )

@@ -95,10 +95,15 @@ def _visible_ends(
 ) -> FloatArray:
     """Return the ends (K, W, 2) of the visible part along the stripe, in metres; NaN if none."""
     share = np.linspace(0.0, 1.0, _N_SEARCH)
+    (width, height), free = camera.size_px, 2.0 * margin
     # The first pass covers the whole fan, which may be much wider than the picture.
     for _ in range(_N_PASSES):
         place = fan[..., :1] + share * (fan[..., 1:] - fan[..., :1])
-        inside = _depth_in_picture(camera, _points(centre, along, place), margin)
+        pixels, valid = camera.project(_points(centre, along, place))
+        x, y = pixels[..., 0] + 0.5 - margin, pixels[..., 1] + 0.5 - margin
+        # Distance to the picture's border in pixels, negative outside; NaN if not seen.
+        inside = np.minimum(np.minimum(x, width - free - x), np.minimum(y, height - free - y))
+        inside = np.where(valid, inside, np.nan)
         seen = inside > 0.0
         first = np.argmax(seen, axis=-1)
         last = _N_SEARCH - 1 - np.argmax(seen[..., ::-1], axis=-1)
@@ -112,16 +117,6 @@ def _visible_ends(
 
 def _points(centre: FloatArray, along: FloatArray, place: FloatArray) -> FloatArray:
     return centre[..., None, :] + place[..., None] * along[:, None, None, :]
-
-
-def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> FloatArray:
-    """Return the distance to the picture's border in pixels, negative outside; NaN if not seen."""
-    pixels, valid = camera.project(points)
-    width, height = camera.size_px
-    x, y = pixels[..., 0] + 0.5 - margin, pixels[..., 1] + 0.5 - margin
-    free = 2.0 * margin
-    depth = np.minimum(np.minimum(x, width - free - x), np.minimum(y, height - free - y))
-    return np.where(valid, depth, np.nan)
 
 
 def _at(values: FloatArray, i: IntArray) -> FloatArray:

@@ -118,21 +118,8 @@ def pixels_all(
 
 
 @inline_kernel
-def write_intrinsics_jacobian(
-    lens: LensParams, x: float, y: float, z: float, jacobian: FloatArray
-) -> None:
-    """Write d(u, v) / d(fx, fy, cx, cy, distortion...) of one direction into (2, 4 + n)."""
-    jacobian[:] = 0.0
-    if lens.fisheye:
-        _write_fisheye(lens, x, y, z, jacobian)
-    else:
-        _write_opencv(lens, x / z, y / z, jacobian)
-    jacobian[0, 2] = 1.0
-    jacobian[1, 3] = 1.0
-
-
-@inline_kernel
 def _write_opencv(lens: LensParams, x: float, y: float, jacobian: FloatArray) -> None:
+    """Write d(u, v) / d(fx, fy, cx, cy, distortion...) of (x, y, 1) into (2, 4 + n)."""
     q = x * x + y * y
     inverse = 1.0 / (1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6)))
     f = (1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))) * inverse
@@ -492,9 +479,13 @@ def store_parameters(
         if w[OK + j] < 0.0:
             jacobian[start + j] = np.nan
             continue
-        write_intrinsics_jacobian(
-            camera.lens, w[CX + j], w[CY + j], w[CZ + j], jacobian[start + j, :, n_before:]
-        )
+        by_lens, x, y, z = jacobian[start + j, :, n_before:], w[CX + j], w[CY + j], w[CZ + j]
+        by_lens[:] = 0.0
+        if camera.lens.fisheye:
+            _write_fisheye(camera.lens, x, y, z, by_lens)
+        else:
+            _write_opencv(camera.lens, x / z, y / z, by_lens)
+        by_lens[0, 2] = by_lens[1, 3] = 1.0
         for k in range(n_before):
             jacobian[start + j, 0, k] = w[JU + (3 + k) * BLOCK + j]
             jacobian[start + j, 1, k] = w[JV + (3 + k) * BLOCK + j]
