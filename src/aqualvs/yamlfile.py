@@ -10,6 +10,7 @@ Parsing does not recurse, so that no file, however nested, exhausts the stack.
 import re
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -189,21 +190,19 @@ def _parse(text: str) -> Any:
     return builder.content
 
 
+@dataclass(slots=True, eq=False)
 class _Node:
     """A value under construction, or an anchored one."""
 
-    __slots__ = ("anchor", "count", "height", "key", "merged", "merges", "value")
-
-    def __init__(self, value: Any, anchor: str | None, *, count: int = 1, height: int = 0) -> None:
-        self.value = value
-        self.anchor = anchor
-        # Values that it holds, itself included, and levels of lists and mappings.
-        self.count = count
-        self.height = height
-        # Key of a mapping that waits for its value, or `_NO_KEY`, or `_MERGE` (`<<`).
-        self.key: Any = _NO_KEY
-        self.merges = False  # Whether it is `<<`, plain and without a tag.
-        self.merged: list[dict[Any, Any]] = []  # Mappings to fill up from.
+    value: Any
+    anchor: str | None
+    # Values that it holds, itself included, and levels of lists and mappings.
+    count: int = 1
+    height: int = 0
+    # Key of a mapping that waits for its value, or `_NO_KEY`, or `_MERGE` (`<<`).
+    key: Any = _NO_KEY
+    merges: bool = False  # Whether it is `<<`, plain and without a tag.
+    merged: Sequence[dict[Any, Any]] = ()  # Mappings to fill up from.
 
 
 class _Builder:
@@ -283,8 +282,14 @@ class _Builder:
             parent.value.append(node.value)
         elif parent.key is _NO_KEY:
             self._take_key(parent, node, line)
+        elif parent.key is not _MERGE:
+            parent.value[parent.key] = node.value
+            parent.key = _NO_KEY
         else:
-            self._take_value(parent, node, line)
+            merged = node.value if isinstance(node.value, list) else [node.value]
+            if parent.merged or not all(isinstance(one, dict) for one in merged):
+                raise _TextError("<< that is not a mapping, or appears twice", line)
+            parent.merged, parent.key = merged, _NO_KEY
 
     @staticmethod
     def _take_key(parent: _Node, node: _Node, line: int) -> None:
@@ -296,17 +301,6 @@ class _Builder:
             raise _TextError(f"key {_shown(node.value)} appears twice", line, "keep one of them")
         else:
             parent.key = node.value
-
-    @staticmethod
-    def _take_value(parent: _Node, node: _Node, line: int) -> None:
-        key, parent.key = parent.key, _NO_KEY
-        if key is not _MERGE:
-            parent.value[key] = node.value
-            return
-        merged = node.value if isinstance(node.value, list) else [node.value]
-        if parent.merged or not all(isinstance(one, dict) for one in merged):
-            raise _TextError("<< that is not a mapping, or appears twice", line)
-        parent.merged = merged
 
 
 def _scalar(event: yaml.ScalarEvent, line: int) -> Any:

@@ -150,8 +150,31 @@ class Lens:
     """Packed numbers for compiled kernels."""
 
     def __post_init__(self) -> None:
-        _check(self)
-        object.__setattr__(self, "params", _params(self))
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        if not np.all(np.isfinite((*intrinsics, *self.distortion))):
+            raise RigError(
+                f"lens has intrinsics {(*intrinsics, *self.distortion)}; every one must be a "
+                "finite number"
+            )
+        if not (self.fx > 0.0 and self.fy > 0.0):
+            raise RigError(
+                f"lens has focal lengths fx = {self.fx}, fy = {self.fy} px; both must be positive"
+            )
+        allowed = COEFFICIENT_COUNTS[LensModel(self.model)]
+        if len(self.distortion) not in allowed:
+            raise RigError(
+                f"lens has {len(self.distortion)} distortion coefficients; the {self.model} model "
+                f"takes {' or '.join(map(str, allowed))}"
+            )
+        fisheye = self.model is LensModel.FISHEYE
+        names = _FISHEYE_NAMES if fisheye else _OPENCV_NAMES
+        values = dict.fromkeys(_OPENCV_NAMES, 0.0)
+        values.update(zip(names, map(float, self.distortion), strict=False))
+        numbers = [*map(float, intrinsics), *values.values(), 0.0, 0.0]
+        params = LensParams._make([fisheye, *numbers])
+        limit, limit_distorted = fisheye_limits(params) if fisheye else opencv_limits(params)
+        params = params._replace(limit=limit, limit_distorted=limit_distorted)
+        object.__setattr__(self, "params", params)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -221,38 +244,3 @@ class Lens:
 
         pixels_all(self.params, d.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
-
-
-def _check(lens: Lens) -> None:
-    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    if not np.all(np.isfinite(values)):
-        raise RigError(f"lens has intrinsics {values}; every one must be a finite number")
-    if not (lens.fx > 0.0 and lens.fy > 0.0):
-        raise RigError(
-            f"lens has focal lengths fx = {lens.fx}, fy = {lens.fy} px; both must be positive"
-        )
-    allowed = COEFFICIENT_COUNTS[LensModel(lens.model)]
-    if len(lens.distortion) not in allowed:
-        raise RigError(
-            f"lens has {len(lens.distortion)} distortion coefficients; the {lens.model} model "
-            f"takes {' or '.join(map(str, allowed))}"
-        )
-
-
-def _params(lens: Lens) -> LensParams:
-    fisheye = lens.model is LensModel.FISHEYE
-    names = _FISHEYE_NAMES if fisheye else _OPENCV_NAMES
-    values = dict.fromkeys(_OPENCV_NAMES, 0.0)
-    values.update(zip(names, map(float, lens.distortion), strict=False))
-    params = LensParams(
-        fisheye=fisheye,
-        fx=float(lens.fx),
-        fy=float(lens.fy),
-        cx=float(lens.cx),
-        cy=float(lens.cy),
-        limit=0.0,
-        limit_distorted=0.0,
-        **values,
-    )
-    limit, limit_distorted = fisheye_limits(params) if fisheye else opencv_limits(params)
-    return params._replace(limit=limit, limit_distorted=limit_distorted)

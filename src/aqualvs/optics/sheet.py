@@ -367,7 +367,14 @@ class Sheet:
         points = points[valid]
         distance = np.linalg.norm(points, axis=-1)
         near, far = working_range
-        return self._fitted(points[(distance >= near) & (distance <= far)])
+        points = points[(distance >= near) & (distance <= far)]
+        start = Plane(self._row[START : START + 3].copy(), float(self._row[START + 3]))
+        if len(points) < 3:
+            return start
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
+        normal = normal if normal @ start.normal > 0.0 else -normal
+        return Plane.from_normal(normal, float(normal @ middle))
 
     def shine(self, directions: ArrayLike) -> tuple[Rays, FloatArray]:
         """Trace light from the source through the window.
@@ -510,16 +517,6 @@ class Sheet:
         return self.tangent_plane(
             source + depth / float(inward @ face) * inward + _USUAL_REACH * bent
         )
-
-    def _fitted(self, points: FloatArray) -> Plane:
-        """Return the least-squares plane of points on the sheet; the tangent plane if too few."""
-        start = Plane(self._row[START : START + 3].copy(), float(self._row[START + 3]))
-        if len(points) < 3:
-            return start
-        middle = points.mean(axis=0)
-        normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
-        normal = normal if normal @ start.normal > 0.0 else -normal
-        return Plane.from_normal(normal, float(normal @ middle))
 
 
 def sheet_in(laser: Laser, n_air: float, n_water: float) -> Sheet:

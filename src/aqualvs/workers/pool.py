@@ -174,11 +174,9 @@ class SharedMemory:
     @classmethod
     def new(cls) -> Self | None:
         """Return new memory; None where the system has none to share."""
-        if not hasattr(os, "memfd_create"):
-            return None
         try:
             file = os.memfd_create("aqualvs")
-        except OSError:
+        except (AttributeError, OSError):
             return None
         try:
             return cls(file)
