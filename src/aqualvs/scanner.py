@@ -43,7 +43,6 @@ from aqualvs.scanning.surfaces import (
 from aqualvs.scanning.triangulate import Triangulator
 
 if TYPE_CHECKING:
-    from aqualvs.scanning.paper.detector import PaperFilter
     from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 
 
@@ -151,7 +150,15 @@ class Scanner:
         self._searches = {field: self._make_search(camera, field) for field in fields}
         laser_bands = self._search(0).laser_bands
         self._posture_estimator = PostureEstimator(rig, laser_bands, self.options.fit)
-        self._paper_filter = self._make_paper_filter(camera, laser_bands)
+        self._paper_filter = None
+        if self.options.mesh_filter is not None:
+            # Only for comparisons with the paper.
+            from aqualvs.scanning.paper.detector import PaperFilter
+
+            every_pixel = not isinstance(self.options.detector, StripeOptions)
+            self._paper_filter = PaperFilter(
+                rig, camera, laser_bands, self.options.mesh_filter, every_pixel=every_pixel
+            )
         self._row_motion = None
         if rig.shutter.rolls:
             # Only for rolling shutters.
@@ -286,18 +293,6 @@ class Scanner:
 
     def _search(self, index: int) -> _StripeSearch:
         return self._searches[self.rig.shutter.field_of(index)]
-
-    def _make_paper_filter(
-        self, camera: Camera, laser_bands: tuple[LaserBand, ...]
-    ) -> "PaperFilter | None":
-        options = self.options.mesh_filter
-        if options is None:
-            return None
-        # Only for comparisons with the paper.
-        from aqualvs.scanning.paper.detector import PaperFilter
-
-        every_pixel = not isinstance(self.options.detector, StripeOptions)
-        return PaperFilter(self.rig, camera, laser_bands, options, every_pixel=every_pixel)
 
     def _estimate(
         self, candidates: Candidates, assignment: AssignmentTest, has_colour: bool

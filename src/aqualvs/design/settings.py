@@ -92,10 +92,13 @@ def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, .
     mounts = []
     for i in range(count):
         polar = -math.pi / 2 - i * step
+        x, z = math.cos(polar), math.sin(polar)
+        upright = "lower" if z < -0.4 else "upper" if z > 0.4 else ""
+        level = "left" if x < -0.4 else "right" if x > 0.4 else ""
         mounts.append(
             Mount(
-                name=_place_name(polar, i),
-                position=(baseline * math.cos(polar), -back, baseline * math.sin(polar)),
+                name="_".join(filter(None, (upright, level))) or f"laser_{i + 1}",
+                position=(baseline * x, -back, baseline * z),
                 stripe=_line_direction(polar + math.pi / 2),
                 tilt=0.0,
                 fan=fan,
@@ -158,14 +161,6 @@ def _line_direction(angle: float) -> float:
     """Return the direction of a line between 0 and pi; just below pi, by rounding, is 0."""
     turned = angle % math.pi
     return 0.0 if math.pi - turned < 1e-12 else turned
-
-
-def _place_name(polar: float, i: int) -> str:
-    """Return a name for a position around the axis, such as "lower_left"; `polar` in radians."""
-    x, z = math.cos(polar), math.sin(polar)
-    upright = "lower" if z < -0.4 else "upper" if z > 0.4 else ""
-    level = "left" if x < -0.4 else "right" if x > 0.4 else ""
-    return "_".join(word for word in (upright, level) if word) or f"laser_{i + 1}"
 
 
 N_WALLS = 9

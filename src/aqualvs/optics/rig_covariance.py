@@ -111,8 +111,6 @@ class PostureErrors:
     ----------
     names : tuple of str
         Numbers of the rig that have an uncertainty, P of them.
-    covariance : array, shape (P, P)
-        Theirs.
     """
 
     def __init__(self, rig: Rig, camera: Camera, uncertainty: RigUncertainty) -> None:
@@ -120,7 +118,6 @@ class PostureErrors:
         step_share, largest_step = 0.1, 1e-4
         sigmas = uncertainty.sigmas
         self.names = tuple(name for name in uncertainty.names if sigmas[name] > 0.0)
-        self.covariance = uncertainty.of(self.names)
         steps = {name: min(step_share * sigmas[name], largest_step) for name in self.names}
         self._n_lasers = len(rig.lasers)
         own = parameter_names(camera)
@@ -130,7 +127,7 @@ class PostureErrors:
             _derivatives_on_lattice(replace(rig, housing=camera.housing), camera_steps),
             _sheet_moves(rig, camera, steps),
             np.array(camera_columns, np.int64),
-            self.covariance,
+            uncertainty.of(self.names),
         )
 
     def propagate(

@@ -50,18 +50,14 @@ EXACT = "exact"
 _UNCERTAINTY = "uncertainty"
 _PLACE = f"solved_from.{_UNCERTAINTY}"
 _KEYS = ("parameters", "sigma", "correlation")
-_DEG = 180.0 / math.pi
-_MM = (
-    *("lens_x", "lens_y", "lens_z", "inner_radius", "thickness", "port_distance"),
-    *("offset", "window_offset"),
-)
-_UNIT_OF = {
-    **dict.fromkeys((*_MM, "source_1", "source_2"), ("mm", 1e3)),
-    **dict.fromkeys(("rotation_x", "rotation_y", "rotation_z"), ("deg", _DEG)),
-    **dict.fromkeys(("port_tilt_x", "port_tilt_y"), ("deg", _DEG)),
-    **dict.fromkeys(("tilt_1", "tilt_2", "window_tilt_1", "window_tilt_2"), ("deg", _DEG)),
-    **dict.fromkeys(("fx", "fy", "cx", "cy"), ("px", 1.0)),
+_UNITS = {
+    ("mm", 1e3): "lens_x lens_y lens_z inner_radius thickness port_distance offset window_offset "
+    "source_1 source_2",
+    ("deg", 180.0 / math.pi): "rotation_x rotation_y rotation_z port_tilt_x port_tilt_y tilt_1 "
+    "tilt_2 window_tilt_1 window_tilt_2",
+    ("px", 1.0): "fx fy cx cy",
 }
+_UNIT_OF = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
