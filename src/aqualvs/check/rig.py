@@ -289,18 +289,16 @@ def _check_lens(rig: Rig) -> Iterator[Finding]:
         yield Finding.ok("There is no dome and no water: rays start at the lens, in air.")
     elif rig.dome is None:
         yield Finding.warn("There is no dome: rays start at the lens, in the water.")
+    elif distance >= rig.dome.inner_radius:
+        yield Finding.bad(
+            f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, outside the inner "
+            f"radius of {rig.dome.inner_radius * 1e3:g} mm; correct camera.position_mm."
+        )
     else:
-        gap = rig.dome.inner_radius - distance
-        if gap <= 0.0:
-            yield Finding.bad(
-                f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, outside the inner "
-                f"radius of {rig.dome.inner_radius * 1e3:g} mm; correct camera.position_mm."
-            )
-        else:
-            yield Finding.ok(
-                f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, "
-                f"{gap * 1e3:.1f} mm inside the dome."
-            )
+        yield Finding.ok(
+            f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, "
+            f"{(rig.dome.inner_radius - distance) * 1e3:.1f} mm inside the dome."
+        )
     width, height = rig.size_px
     across, down = (rig.lens.cx + 0.5) / width, (rig.lens.cy + 0.5) / height
     if not (0.25 < across < 0.75 and 0.25 < down < 0.75):

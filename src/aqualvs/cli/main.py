@@ -42,27 +42,24 @@ class LenientStream:
 
     def write(self, text: str) -> int:
         """Write a text, or drop it after a fault."""
-        if self.fault is None:
-            with self._keeping_fault():
+        try:
+            if self.fault is None:
                 return self._stream.write(text)
+        except OSError as fault:
+            self.fault = fault
         return len(text)
 
     def flush(self) -> None:
         """Flush the stream."""
-        if self.fault is None:
-            with self._keeping_fault():
+        try:
+            if self.fault is None:
                 self._stream.flush()
+        except OSError as fault:
+            self.fault = fault
 
     def __getattr__(self, name: str) -> Any:
         """Return any other attribute of the stream."""
         return getattr(self._stream, name)
-
-    @contextlib.contextmanager
-    def _keeping_fault(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as fault:
-            self.fault = fault
 
 
 @contextlib.contextmanager
