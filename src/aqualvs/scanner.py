@@ -206,19 +206,9 @@ class Scanner:
         water the glow beside a line is as green as the line. Lamps and daylight make more peaks on
         twine than the lasers, but lower ones.
 
-        Parameters
-        ----------
-        frame : Frame
-        peaks : FramePeaks
-            From `detect`.
-        scan : Scan
-            From `measure` with these peaks.
-
-        Returns
-        -------
-        peaks, scan
-            Of the tallest peaks if they give a posture that is certain without colour, and has many
-            more points than any before; else as given.
+        `peaks` are from `detect`, and `scan` is what `measure` makes of them. Returns those of the
+        tallest peaks if they give a posture that is certain without colour, and has many more
+        points than any before; else as given.
         """
         finds_stripes = isinstance(self.options.detector, StripeOptions)
         if not (finds_stripes and _may_lack_colour(peaks, scan)):
