@@ -13,10 +13,10 @@ from aqualvs.closing import Closing
 from aqualvs.errors import AqualvsError, OptionError, RigError, SourceError
 from aqualvs.nets.target_file import net_check
 from aqualvs.optics.rig import Rig
+from aqualvs.results.agreement import LaserAgreement
 from aqualvs.results.run_request import RunRequest, check_fits, prepared_rig
 from aqualvs.results.summary import RunSummary, TruthComparison, compare_with_truth, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, VideoSource, open_source
 from aqualvs.sources.fields import FieldEvidence, first_pairs, source_of_frames, source_of_pictures
 from aqualvs.sources.opening import existing_path, is_address
