@@ -399,12 +399,17 @@ def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     near, far = rig.working_range
     # Least distance of the plane from the lens, in metres: nearer, one pixel is hundreds of
     # millimetres of range at 0.6 m.
-    least_baseline = 1e-3
+    least_baseline, small_baseline = 1e-3, 10e-3
     baseline = abs(float(laser.plane.normal @ rig.dome_from_cam.translation) - laser.plane.offset)
     if baseline < least_baseline:
         return Finding.bad(
             f"Laser '{laser.name}' passes the lens at {baseline * 1e3:.2g} mm, so that its stripe "
             "does not move with range; offset_mm is in millimetres."
+        )
+    if baseline < small_baseline:
+        return Finding.warn(
+            f"Laser '{laser.name}' passes the lens at {baseline * 1e3:.2g} mm, so that its stripe "
+            "hardly moves with range; turn its line across the way from the lens to the laser."
         )
     n_ranges = 43
     walls = np.geomspace(near, far, n_ranges)

@@ -98,11 +98,14 @@ def _candidates(mount: Mount, i_grid: int, halfway: float) -> list[Mount]:
     if mount.free_stripe:
         whole = np.arange(0.0, math.pi - 1e-9, _STRIPE_STEPS[0]).tolist()
         stripes = whole if first else _around(mount.stripe, _STRIPE_STEPS[i_grid], _HALF_STRIPES)
+    # A stripe is turned only as far as half of the baseline remains: one whose sheet passes the
+    # lens does not move with range.
+    least = 0.5 * math.hypot(mount.position[0], mount.position[2]) if mount.free_stripe else 0.0
+    turned = [replace(mount, stripe=stripe % math.pi) for stripe in stripes]
     return [
-        replace(mount, tilt=float(np.clip(tilt, *TILT_LIMITS)), stripe=stripe % math.pi).aimed_at(
-            halfway
-        )
-        for stripe in stripes
+        replace(one, tilt=float(np.clip(tilt, *TILT_LIMITS))).aimed_at(halfway)
+        for one in turned
+        if one.baseline >= least
         for tilt in tilts
     ]
 
