@@ -29,7 +29,6 @@ _NOT_OF = {
     "plate": (*_OF_A_BOX, "square_mm"),
 }
 
-# Commands whose request has a field for each of their parameters hand over all of these at once.
 calibrate = typer.Typer(
     name="calibrate",
     help="Make a rig file from pictures: camera, dome, lasers, water, in this order; shutter last.",
@@ -163,14 +162,32 @@ def dome(
     ] = True,
 ) -> None:
     """Calibrate the dome."""
-    given = locals() | {
-        "images": tuple(images),
-        "medium": medium or "air",
-        "water_images": tuple(water_images or ()),
-    }
     from aqualvs.calibrate import dome as body
 
-    body.run_dome(body.DomeRequest(**given), typer.echo)
+    body.run_dome(
+        body.DomeRequest(
+            images=tuple(images),
+            board=board,
+            rig=rig,
+            out=out,
+            poses=poses,
+            medium=medium or "air",
+            water_images=tuple(water_images or ()),
+            water_board=water_board,
+            water_poses=water_poses,
+            inner_radius_mm=inner_radius_mm,
+            thickness_mm=thickness_mm,
+            n_acrylic=n_acrylic,
+            port_distance_mm=port_distance_mm,
+            radius_tolerance_mm=radius_tolerance_mm,
+            thickness_tolerance_mm=thickness_tolerance_mm,
+            acrylic_tolerance=acrylic_tolerance,
+            distance_sigma_mm=distance_sigma_mm,
+            shared_tilt_sigma_deg=shared_tilt_sigma_deg,
+            refine_intrinsics=refine_intrinsics,
+        ),
+        typer.echo,
+    )
 
 
 @calibrate.command(
@@ -206,13 +223,24 @@ def lasers(
     ] = False,
 ) -> None:
     """Calibrate the lasers."""
-    given = locals() | {
-        "images": tuple(images),
-        "names": None if names is None else tuple(name.strip() for name in names.split(",")),
-    }
     from aqualvs.calibrate import lasers as body
 
-    body.run_lasers(body.LasersRequest(**given), typer.echo)
+    body.run_lasers(
+        body.LasersRequest(
+            images=tuple(images),
+            rig=rig,
+            out=out,
+            box=box,
+            board=board,
+            medium=medium,
+            n_lasers=n_lasers,
+            names=None if names is None else tuple(name.strip() for name in names.split(",")),
+            board_offset_mm=board_offset_mm,
+            refine=refine,
+            wavelength_nm=wavelength_nm,
+        ),
+        typer.echo,
+    )
 
 
 @calibrate.command(
@@ -238,10 +266,22 @@ def water(
     ] = 0.1,
 ) -> None:
     """Calibrate the water."""
-    given = locals() | {"source": tuple(source)}
     from aqualvs.calibrate import water as body
 
-    body.run_water(body.WaterRequest(**given), typer.echo)
+    body.run_water(
+        body.WaterRequest(
+            source=tuple(source),
+            target=target,
+            rig=rig,
+            out=out,
+            temperature_c=temperature_c,
+            salinity=salinity,
+            fps=fps,
+            place_sigma_mm=place_sigma_mm,
+            turn_sigma_deg=turn_sigma_deg,
+        ),
+        typer.echo,
+    )
 
 
 @calibrate.command(
@@ -304,11 +344,30 @@ def board(
     overwrite: Overwrite = False,
 ) -> None:
     """Print a target."""
-    given = {name: value for name, value in locals().items() if name != "context"}
     refuse_given(context, _NOT_OF[kind], f"not of a {kind}; leave it out")
     from aqualvs.calibrate import board as body
 
-    body.print_board(body.BoardRequest(**given), typer.echo)
+    body.print_board(
+        body.BoardRequest(
+            kind=kind,
+            out=out,
+            paper=paper,
+            squares_x=squares_x,
+            squares_y=squares_y,
+            square_mm=square_mm,
+            marker_mm=marker_mm,
+            dictionary=dictionary,
+            border_mm=border_mm,
+            width_mm=width_mm,
+            height_mm=height_mm,
+            depth_mm=depth_mm,
+            first_id=first_id,
+            position_mm=position_mm,
+            rotation_deg=rotation_deg,
+            overwrite=overwrite,
+        ),
+        typer.echo,
+    )
 
 
 def import_file(
