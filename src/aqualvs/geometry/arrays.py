@@ -14,7 +14,10 @@ U8Array: TypeAlias = NDArray[np.uint8]
 def as_vectors(values: ArrayLike, size: int, name: str) -> FloatArray:
     """Return `values` as a contiguous float64 array of shape (..., size).
 
-    Raises `ValueError` with `name` and the shape, if the last axis does not have length `size`.
+    Raises
+    ------
+    ValueError
+        If the last axis does not have length `size`; the message names `name` and the shape.
     """
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != size:

@@ -35,7 +35,10 @@ class Plane:
     def from_normal(cls, normal: ArrayLike, offset: float) -> "Plane":
         """Make a plane from a normal of any length; `offset` belongs to the normal as given.
 
-        Raises `ValueError` if the normal is zero or not finite.
+        Raises
+        ------
+        ValueError
+            If the normal is zero or not finite.
         """
         vector = as_vectors(normal, 3, "normal")
         length = float(np.linalg.norm(vector))
@@ -90,8 +93,17 @@ def exchanged_plane(plane: Plane, first: Plane, second: Plane) -> Plane | None:
     sight through the origin. These meet the other sheet on the plane (s + t - m)·X = 1, so two
     stripes alone do not tell which of the two planes is there.
 
-    The stripes of the sheets `first` and `second` are on `plane`. The offset returned is positive;
-    None if it is infinitely far, or a sheet passes the origin.
+    Parameters
+    ----------
+    plane : Plane
+        On which the stripes are.
+    first, second : Plane
+        The sheets.
+
+    Returns
+    -------
+    Plane or None
+        Its offset is positive; None if it is infinitely far, or a sheet passes the origin.
     """
     offsets = np.array([first.offset, second.offset, plane.offset])
     if not offsets.all():
@@ -108,9 +120,17 @@ def shifted_plane(plane: Plane, sheets: Sequence[Plane], read_as: Sequence[Plane
     another sheet t·X = 1 on all planes (t + a (s - m))·X = 1; the plane returned is nearest to one
     of these for each stripe. For two sheets that are exchanged it is `exchanged_plane`.
 
-    The stripes are on `plane`, each of one of the `sheets` and read as that of `read_as`; there are
-    two or more. The offset returned is positive; None if the plane is not determined, or a sheet
-    passes the origin.
+    Parameters
+    ----------
+    plane : Plane
+        On which the stripes are.
+    sheets, read_as : sequence of Plane
+        The sheet of each stripe, and that which it is read as; two or more.
+
+    Returns
+    -------
+    Plane or None
+        The offset is positive. None if the plane is not determined or a sheet passes the origin.
     """
     if not all(one.offset for one in (plane, *sheets, *read_as)):
         return None
@@ -131,8 +151,12 @@ def shifted_plane(plane: Plane, sheets: Sequence[Plane], read_as: Sequence[Plane
 def upright_axes(normal: FloatArray) -> FloatArray:
     """Return axes on a plane in `dome`, the columns of a rotation (3, 3).
 
-    They are horizontal to the right, along the normal, and up the plane. `normal`, shape (3,): unit
-    normal that points away from the vehicle; not vertical.
+    They are horizontal to the right, along the normal, and up the plane.
+
+    Parameters
+    ----------
+    normal : array, shape (3,)
+        Unit normal that points away from the vehicle; not vertical.
     """
     up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
     up /= max(float(np.linalg.norm(up)), 1e-9)

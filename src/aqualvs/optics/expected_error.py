@@ -153,8 +153,14 @@ def expected_posture_errors(
 ) -> tuple[ExpectedError, ...]:
     """Propagate a rig's uncertainty, and noise of the pixels, to range, pitch and yaw.
 
-    `uncertainty`: joint covariance of camera, dome, water and lasers; numbers not in it are taken
-    as exact. `ranges`: walls square to the forward axis, metres.
+    Parameters
+    ----------
+    rig : Rig
+        With lasers.
+    uncertainty : RigUncertainty
+        Joint covariance of camera, dome, water and lasers; numbers not in it are taken as exact.
+    ranges : sequence of float
+        Walls square to the forward axis, metres.
     """
     errors = PostureErrors(rig, rig.camera(), uncertainty)
     return tuple(

@@ -42,10 +42,22 @@ def leave_sphere(
 ) -> tuple[float, float, float, float, float, float, float]:
     """Carry a ray from inside a sphere round the origin to its surface and refract it there.
 
-    The ray starts at (px, py, pz), inside the sphere or on it, in the unit direction (dx, dy, dz);
-    `ratio` is n inside / n outside. Returns (radicand, qx, qy, qz, ex, ey, ez): point on the sphere
-    and unit direction outside it. A radicand that is not >= 0 means total reflection; point and
-    direction are then meaningless.
+    Parameters
+    ----------
+    px, py, pz : float
+        Start, inside the sphere or on it.
+    dx, dy, dz : float
+        Unit direction.
+    radius : float
+        Of the sphere.
+    ratio : float
+        n inside / n outside.
+
+    Returns
+    -------
+    radicand, qx, qy, qz, ex, ey, ez : float
+        Point on the sphere and unit direction outside it. A radicand that is not >= 0 means total
+        reflection; point and direction are then meaningless.
     """
     along = px * dx + py * dy + pz * dz
     # The cosine of incidence times the radius, because the normal is the point itself.
@@ -64,11 +76,22 @@ def leave_sphere(
 def leave_plane(p: Vec, d: Vec, normal: Vec, height: float, ratio: float) -> tuple[float, Vec, Vec]:
     """Carry a ray from `height` behind a plane to it and refract it there.
 
-    The ray starts at p in the unit direction d; the plane is at the distance `height` from there
-    along its normal, which points away from the start. `ratio` is n before / n behind the plane.
-    Returns (radicand, q, e): point on the plane and unit direction behind it. A radicand that is
-    not positive means total reflection, or a direction that does not meet the plane; both are then
-    meaningless.
+    Parameters
+    ----------
+    p, d : vector
+        Start and unit direction.
+    normal : vector
+        Of the plane, away from the start.
+    height : float
+        Distance of the plane from the start along the normal.
+    ratio : float
+        n before / n behind the plane.
+
+    Returns
+    -------
+    radicand, q, e
+        Point on the plane and unit direction behind it. A radicand that is not positive means
+        total reflection, or a direction that does not meet the plane; both are then meaningless.
     """
     cos_in = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
     step = height / cos_in

@@ -309,8 +309,16 @@ def _propagate(
 ) -> None:
     """Write the derivatives J (3, P) of range, pitch and yaw by the rig's parameters, and J C J^T.
 
-    The points are those of `PostureErrors.propagate`; `each` is the largest number of short
-    segments for a laser. `covariance` (3, 3) is zero at first.
+    Parameters
+    ----------
+    surface, pixels, laser, points, weights
+        As in `PostureErrors.propagate`.
+    n_lasers, each : int
+        Number of lasers, and the largest number of short segments for each.
+    rig_errors : _RigErrors
+        With P parameters.
+    jacobian : array, shape (3, P), covariance : array, shape (3, 3)
+        Written; the second zero at first.
     """
     sums = _sum_up(pixels, laser, points, weights, surface.terms, surface.prior, n_lasers, each)
     n, n_terms = jacobian.shape[1], surface.terms.shape[1]

@@ -225,10 +225,21 @@ def rig_to_mapping(rig: Rig) -> dict[str, Any]:
 def rig_from_mapping(
     mapping: Mapping[str, Any], *, source_name: str, need_lasers: bool = True
 ) -> Rig:
-    """Make a rig from the content of a rig file, as `rig_to_mapping` gives it, or as YAML reads it.
+    """Make a rig from the content of a rig file.
 
-    `source_name` is the name of the file in messages; `need_lasers` is as in `load_rig`. Raises
-    `RigError` with one line that names the file, the place in it, the value and the remedy.
+    Parameters
+    ----------
+    mapping : mapping
+        As `rig_to_mapping` gives it, or as YAML reads it.
+    source_name : str
+        Name of the file in messages.
+    need_lasers : bool
+        As in `load_rig`.
+
+    Raises
+    ------
+    RigError
+        One line that names the file, the place in it, the value and the remedy.
     """
     file = parse_rig(mapping, source_name)
     try:

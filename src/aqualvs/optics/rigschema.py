@@ -272,10 +272,19 @@ def rig_json_schema() -> dict[str, Any]:
 
 
 def parse_rig(content: object, source_name: str) -> RigFile:
-    """Check the content of a rig file, as read from YAML, key by key.
+    """Check the content of a rig file, key by key.
 
-    `source_name` is the name of the file in messages. Raises `RigError` with one line on the first
-    fault: file, place, value, remedy.
+    Parameters
+    ----------
+    content : object
+        Content of the file as read from YAML.
+    source_name : str
+        Name of the file in messages.
+
+    Raises
+    ------
+    RigError
+        One line on the first fault: file, place, value, remedy.
     """
     if not isinstance(content, Mapping):
         raise RigError(

@@ -379,10 +379,23 @@ class Sheet:
     def shine(self, directions: ArrayLike) -> tuple[Rays, FloatArray]:
         """Trace light from the source through the window.
 
-        `directions`, shape (..., 3): unit directions in air; those in the laser's plane are the
-        sheet. Returns the rays in the water, from the window's face on, and the length (...) of the
-        light's way to the face, in metres. Rays are not valid where the light misses the window or
-        is reflected back. Raises `ValueError` if there is no window.
+        Parameters
+        ----------
+        directions : array, shape (..., 3)
+            Unit directions in air; those in the laser's plane are the sheet.
+
+        Returns
+        -------
+        rays : Rays
+            In the water, from the window's face on; not valid where the light misses the window or
+            is reflected back.
+        way : array, shape (...)
+            Length of the light's way to the face, in metres.
+
+        Raises
+        ------
+        ValueError
+            If there is no window.
         """
         if self.window is None:
             raise ValueError("a sheet without a window has no source")
@@ -532,7 +545,12 @@ def sheets_of(rig: Rig) -> tuple[Sheet, ...]:
 def packed_sheets(rig: Rig, camera: Camera) -> FloatArray:
     """Return a rig's sheets as kernels take them, shape (n, COLUMNS).
 
-    Searches along the camera's rays begin at the planes that best fit the sheets in its view.
+    Parameters
+    ----------
+    rig : Rig
+        Lasers, indices and working range.
+    camera : Camera
+        Searches along its rays begin at the planes that best fit the sheets in its view.
     """
     rows = [s.packed(s.best_plane(camera, rig.working_range)) for s in sheets_of(rig)]
     return np.array(rows).reshape(-1, COLUMNS)

@@ -135,7 +135,12 @@ class Shutter:
     def row_times(self, rows: ArrayLike, height: int) -> FloatArray:
         """Return the middles of the exposures of rows, in seconds from the picture's middle.
 
-        `rows`: the centre of the top one is 0. `height`: of the picture, in pixels.
+        Parameters
+        ----------
+        rows : array-like
+            Rows of the picture, the centre of the top one being 0.
+        height : int
+            Of the picture, in pixels.
         """
         rows = np.asarray(rows, np.float64)
         if self.is_interlaced:
