@@ -21,7 +21,8 @@ from aqualvs.scanning.laser_bands import plan_bands, search_range
 from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import TargetKind, choose_target, find_surfaces
+from aqualvs.scanning.surfaces import find_surfaces
+from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig
@@ -110,20 +111,18 @@ def _cost() -> list[dict[str, Any]]:
 
 def _label_ms(candidates: Candidates, laser_bands: Any) -> float:
     rig = example_rig()
-    subsegments, shapes = candidates.subsegments()
+    linked = candidates.linked()
     reach = search_range(rig.working_range)
-    surfaces = find_surfaces(subsegments, candidates.pixels, 3, reach, rig.focal_px)
+    surfaces = find_surfaces(linked.subsegments, candidates.pixels, 3, reach, rig.focal_px)
     target = choose_target(surfaces, TargetKind.AUTO, rig.working_range)
     assert target is not None
     found = PostureEstimator(rig, laser_bands, FitMethod.ROBUST).measure(
-        candidates, subsegments, target
+        candidates, linked.subsegments, target
     )
     times = []
     for _ in range(100):
         start = time.perf_counter()
-        label_candidates(
-            candidates, subsegments, shapes, surfaces, target, found, rig.working_range
-        )
+        label_candidates(linked, surfaces, target, found, rig.working_range)
         times.append(time.perf_counter() - start)
     return float(np.median(times)) * 1e3
 

@@ -30,7 +30,8 @@ from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import TargetKind, choose_target, find_surfaces
+from aqualvs.scanning.surfaces import find_surfaces
+from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
@@ -195,7 +196,7 @@ def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
     candidates = find_candidates(peaks, laser_bands, triangulator)
 
     def surfaces() -> tuple[Subsegments, Any]:
-        subsegments, _ = candidates.subsegments()
+        subsegments = candidates.linked().subsegments
         found = find_surfaces(
             subsegments, candidates.pixels, len(rig.lasers), (0.8 * near, 1.2 * far), rig.focal_px
         )

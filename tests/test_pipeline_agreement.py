@@ -14,10 +14,10 @@ from aqualvs.optics.rigfile import rig_to_mapping, save_rig
 from aqualvs.optics.solved import with_uncertainty
 from aqualvs.pipeline import open_dive, run, summary_for, summary_lines
 from aqualvs.report.run_page import write_report
+from aqualvs.results.agreement import LaserAgreement
 from aqualvs.results.folder import RunOutputs, prepare_folder
 from aqualvs.results.run_request import RunRequest
 from aqualvs.results.summary import RunSummary
-from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.simulation.scenarios import example_rig
 from report_cases import make_dive

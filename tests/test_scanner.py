@@ -21,7 +21,8 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.stripe import ThresholdOptions, flank_difference
-from aqualvs.scanning.surfaces import Surface, TargetKind, find_surfaces
+from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import merged, peaks_of
 from scanning_cases import strands as broken

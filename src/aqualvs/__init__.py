@@ -40,35 +40,25 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = {
-    "AqualvsError": "aqualvs.errors",
-    "Calibration": "aqualvs.calibrate.common",
-    "CalibrationFiles": "aqualvs.simulation.calibration_set",
-    "Frame": "aqualvs.scanning.scan",
-    "Label": "aqualvs.scanning.scan",
-    "Posture": "aqualvs.scanning.posture",
-    "Reason": "aqualvs.scanning.posture",
-    "Refusal": "aqualvs.scanning.posture",
-    "Rig": "aqualvs.optics.rig",
-    "RunRequest": "aqualvs.results.run_request",
-    "RunResult": "aqualvs.pipeline",
-    "Scan": "aqualvs.scanning.scan",
-    "ScanPoints": "aqualvs.scanning.scan",
-    "Scanner": "aqualvs.scanner",
-    "ScannerOptions": "aqualvs.scanner",
-    "SetSize": "aqualvs.simulation.calibration_set",
-    "calibrate_camera": "aqualvs.calibrate.camera",
-    "calibrate_dome": "aqualvs.calibrate.dome",
-    "calibrate_lasers": "aqualvs.calibrate.lasers",
-    "calibrate_water": "aqualvs.calibrate.water",
-    "load_rig": "aqualvs.optics.rigfile",
-    "open_source": "aqualvs.sources",
-    "planes_of_image": "aqualvs.scanning.scan",
-    "read_run": "aqualvs.results.net_survey",
-    "run": "aqualvs.pipeline",
-    "save_rig": "aqualvs.optics.rigfile",
-    "simulate_calibration": "aqualvs.simulation.calibration_set",
+_NAMES = {
+    "calibrate.camera": ["calibrate_camera"],
+    "calibrate.common": ["Calibration"],
+    "calibrate.dome": ["calibrate_dome"],
+    "calibrate.lasers": ["calibrate_lasers"],
+    "calibrate.water": ["calibrate_water"],
+    "errors": ["AqualvsError"],
+    "optics.rig": ["Rig"],
+    "optics.rigfile": ["load_rig", "save_rig"],
+    "pipeline": ["RunResult", "run"],
+    "results.net_survey": ["read_run"],
+    "results.run_request": ["RunRequest"],
+    "scanner": ["Scanner", "ScannerOptions"],
+    "scanning.posture": ["Posture", "Reason", "Refusal"],
+    "scanning.scan": ["Frame", "Label", "Scan", "ScanPoints", "planes_of_image"],
+    "simulation.calibration_set": ["CalibrationFiles", "SetSize", "simulate_calibration"],
+    "sources": ["open_source"],
 }
+_MODULES = {name: f"aqualvs.{module}" for module, names in _NAMES.items() for name in names}
 
 __all__ = sorted(_MODULES)
 

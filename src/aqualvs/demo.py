@@ -9,8 +9,6 @@ from aqualvs.pipeline import run_and_print
 from aqualvs.results.run_request import RunRequest
 from aqualvs.terminal import Echo
 
-_FILES = ("dive.mp4", "rig.yaml", "truth.csv")
-
 
 def demo(out: Path, echo: Echo, *, overwrite: bool = False) -> int:
     """Run the bundled dive, print posture and error, and return the exit code.
@@ -18,7 +16,10 @@ def demo(out: Path, echo: Echo, *, overwrite: bool = False) -> int:
     Raises `AqualvsError` if the installation lacks the dive, or `out` cannot be written.
     """
     with importlib.resources.as_file(bundled_dive()) as folder:
-        dive, rig, truth = (_present(folder / name) for name in _FILES)
+        dive, rig, truth = (folder / name for name in ("dive.mp4", "rig.yaml", "truth.csv"))
+        for path in (dive, rig, truth):
+            if not path.is_file():
+                raise SourceError(f"{path}: missing from this installation; install aqualvs again")
         request = RunRequest(source=str(dive), rig=rig, truth=truth, out=out, overwrite=overwrite)
         return run_and_print(request, echo)
 
@@ -26,9 +27,3 @@ def demo(out: Path, echo: Echo, *, overwrite: bool = False) -> int:
 def bundled_dive() -> Traversable:
     """Return the folder with the dive that comes with the package."""
     return importlib.resources.files("aqualvs") / "data" / "demo"
-
-
-def _present(path: Path) -> Path:
-    if not path.is_file():
-        raise SourceError(f"{path}: missing from this installation; install aqualvs again")
-    return path

@@ -4,7 +4,7 @@
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,10 +13,10 @@ from aqualvs.closing import Closing
 from aqualvs.errors import AqualvsError, OptionError, RigError, SourceError
 from aqualvs.nets.target_file import net_check
 from aqualvs.optics.rig import Rig
+from aqualvs.results.agreement import LaserAgreement
 from aqualvs.results.run_request import RunRequest, check_fits, prepared_rig
 from aqualvs.results.summary import RunSummary, TruthComparison, compare_with_truth, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, VideoSource, open_source
 from aqualvs.sources.fields import FieldEvidence, first_pairs, source_of_frames, source_of_pictures
 from aqualvs.sources.opening import existing_path, is_address
@@ -228,35 +228,30 @@ def summary_for(dive: OpenDive) -> RunSummary:
     return RunSummary(
         agreement=agreement,
         net_check=net_check(request.target, rig),
-        warnings=[*_track_warnings(dive), *_shutter_warnings(dive)],
+        warnings=list(_source_warnings(dive)),
     )
 
 
-def _track_warnings(dive: OpenDive) -> list[str]:
-    """Return a warning if a video holds several tracks."""
-    pictures = source_of_pictures(dive.source)
-    if not isinstance(pictures, VideoSource) or pictures.n_tracks < 2:
-        return []
-    return [
-        f"the video holds {pictures.n_tracks} tracks, the first is measured; for another, copy it "
-        "to a file of its own (ffmpeg -map 0:v:1 -c copy)"
-    ]
-
-
-def _shutter_warnings(dive: OpenDive) -> list[str]:
-    """Return a warning if pictures and rig contradict each other in whether they are interlaced."""
+def _source_warnings(dive: OpenDive) -> Iterator[str]:
+    """Yield a warning of several tracks, and of fields that contradict the rig's shutter."""
     path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
     if isinstance(pictures, VideoSource):
+        if pictures.n_tracks > 1:
+            yield (
+                f"the video holds {pictures.n_tracks} tracks, the first is measured; for another, "
+                "copy it to a file of its own (ffmpeg -map 0:v:1 -c copy)"
+            )
         # A stream cannot be read twice.
         groups, first_field = sampled_pictures(path) if path.is_file() else ([], None)
         evidence = FieldEvidence.of(groups, first_field)
     elif dive.is_replay:
         # Of most recordings there are stripes alone.
-        return []
+        return
     else:
         evidence = FieldEvidence.of(first_pairs(pictures))
     wrong = evidence.contradiction(dive.rig.shutter, pictures.fps)
-    return [wrong] if wrong else []
+    if wrong:
+        yield wrong
 
 
 def _pool_job(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:

@@ -1,22 +1,17 @@
 """Outputs of a run: the files of its folder, its report, and the comparison with the truth.
 
-`RunWriters` writes all files frame by frame. Its parts, beside the folder itself:
-
-- `RunBareLens`: `posture_bare.csv`, the posture without the dome model.
-- `RunOverlay`: `overlay.mp4`, the video of what the scanner detected.
-- `RunMcap`: `dive.mcap`, the recording, on request.
-- `RunRerun`: a file of Rerun, on request.
-- `NetPass`: the state of the net, on request.
+`RunWriters` holds what writes its files frame by frame: the folder itself, `posture_bare.csv`, and
+on request the overlay, a recording, a file of Rerun, and the state of the net.
 """
 
 import statistics
 import time
 from array import array
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -39,7 +34,6 @@ from aqualvs.results.folder import (
 from aqualvs.results.net_survey import NetPass
 from aqualvs.results.run_request import RunRequest, Status, source_dict
 from aqualvs.results.summary import RunSummary
-from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.sources import FrameSource
@@ -51,45 +45,33 @@ from aqualvs.workers.frame_results import FrameResult, ScanInputs
 if TYPE_CHECKING:
     from aqualvs.recording.sample import LiveSample
 
+WriteResult: TypeAlias = Callable[[FrameResult], None]
+"""Writer of the result of a frame."""
 
-class RunMcap(Closing):
-    """Writer of `dive.mcap` during a run; a context manager.
 
-    Parameters
-    ----------
-    rig : Rig
-        For frames that were lost.
-    options : ScannerOptions
-        That the run measures with.
+@contextmanager
+def _mcap(request: RunRequest, rig: Rig) -> Iterator[WriteResult]:
+    """Write `dive.mcap`, with the rig and the stripes that each scan was computed from.
 
-    Raises
-    ------
-    OutputError
-        From every method, if the file cannot be written.
+    A frame that was lost has no stripes. Raises `OutputError` if the file cannot be written.
     """
+    # Few runs write one.
+    from aqualvs.recording import RecorderOptions, Recording
 
-    def __init__(self, folder: Path, rig: Rig, options: ScannerOptions) -> None:
-        # Few runs write one.
-        from aqualvs.recording import RecorderOptions, Recording
+    path, began_ns = request.out / DIVE_MCAP, time.time_ns()
+    with writing(path):
+        recording = Recording(path, RecorderOptions(scanner=request.scanner))
 
-        self._path, self._rig = folder / DIVE_MCAP, rig
-        self._began_ns = time.time_ns()
-        with writing(self._path):
-            self._recording = Recording(self._path, RecorderOptions(scanner=options))
+    def write(result: FrameResult) -> None:
+        inputs = result.inputs or ScanInputs(rig, {})
+        with writing(path):
+            recording.write(_sample(began_ns, result.scan, inputs))
 
-    def write(self, result: FrameResult) -> None:
-        """Record the next scan, with the rig and the stripes that it was computed from.
-
-        A frame that was lost has no stripes.
-        """
-        inputs = result.inputs or ScanInputs(self._rig, {})
-        with writing(self._path):
-            self._recording.write(_sample(self._began_ns, result.scan, inputs))
-
-    def close(self) -> None:
-        """Close the file; readable in any case."""
-        with writing(self._path):
-            self._recording.close()
+    try:
+        yield write
+    finally:
+        with writing(path):
+            recording.close()
 
 
 def _sample(
@@ -112,69 +94,40 @@ def _sample(
     )
 
 
-class RunRerun(Closing):
-    """Writer of a file of Rerun during a run; a context manager.
+@contextmanager
+def _rerun(path: Path, rig: Rig) -> Iterator[WriteResult]:
+    """Write a file of Rerun. Raises `OutputError` if it cannot be written."""
+    from aqualvs.recording.rerun_log import RerunLog
 
-    Raises `OutputError` if the file cannot be written. Raises `OptionError` if rerun-sdk is not
-    installed.
-    """
-
-    def __init__(self, path: Path, rig: Rig) -> None:
-        from aqualvs.recording import rerun_log
-
-        self._rig = rig
-        self._log = rerun_log.RerunLog()
+    with closing(RerunLog()) as log:
         with writing(path):
-            self._log.save(path)
-
-    def write(self, frame: Frame | None, scan: Scan) -> None:
-        """Log the result of a frame."""
-        self._log.write(_sample(0, scan, ScanInputs(self._rig, {}), frame))
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._log.close()
+            log.save(path)
+        yield lambda one: log.write(_sample(0, one.scan, ScanInputs(rig, {}), one.frame))
 
 
-def check_source_stays(folder: Path, source: str) -> None:
-    """Make sure that a run does not replace its own source.
+@contextmanager
+def _overlay(request: RunRequest, rig: Rig, source: FrameSource) -> Iterator[WriteResult]:
+    """Write `overlay.mp4`; a lost frame gives a black picture, so that frames keep their number.
 
-    Raises `OptionError` if the run's own source would be replaced.
+    Raises `OutputError` if the video cannot be written.
     """
-    path = Path(source)
-    is_ours = path.is_file() and path.name in RUN_FILES
-    if is_ours and path.resolve().parent == folder.resolve():
-        raise OptionError(f"{path}: is what the run reads; write to another folder")
+    path, (width, height) = request.out / OVERLAY_MP4, rig.size_px
+    fps_without_clock = 25.0
+    video = OverlayWriter(path, source.size_px, source.fps or fps_without_clock)
 
-
-class RunOverlay(Closing):
-    """Writer of `overlay.mp4` during a run; a context manager.
-
-    `source`: gives size and rate of the video. Raises `OutputError` from every method, if the video
-    cannot be written.
-    """
-
-    def __init__(self, folder: Path, rig: Rig, source: FrameSource) -> None:
-        self._path = folder / OVERLAY_MP4
-        self._rig = rig
-        fps_without_clock = 25.0
-        fps = source.fps or fps_without_clock
-        self._writer = OverlayWriter(self._path, source.size_px, fps)
-
-    def write(self, frame: Frame | None, scan: Scan) -> None:
-        """Append a picture; a lost frame gives a black one, so that frames keep their number."""
-        width, height = self._rig.size_px
+    def write(result: FrameResult) -> None:
         image = np.zeros((height, width, 3), np.uint8)
-        if frame is not None:
-            shown = bgr_of(frame)
+        if result.frame is not None:
+            shown = bgr_of(result.frame)
             image[: len(shown)] = shown
-        with writing(self._path):
-            self._writer.write(draw_overlay(image, scan.points, scan.posture, self._rig))
+        with writing(path):
+            video.write(draw_overlay(image, result.scan.points, result.scan.posture, rig))
 
-    def close(self) -> None:
-        """Finish the video."""
-        with writing(self._path):
-            self._writer.close()
+    try:
+        yield write
+    finally:
+        with writing(path):
+            video.close()
 
 
 class RunBareLens(Closing):
@@ -219,54 +172,36 @@ class RunBareLens(Closing):
             self._file.close()
 
 
-@dataclass(frozen=True, slots=True)
-class RunWriters:
-    """Everything that a run writes frame by frame; None for what was not requested."""
+class RunWriters(NamedTuple):
+    """Everything that a run writes frame by frame."""
 
     folder: RunOutputs
     bare_lens: RunBareLens
-    overlay: RunOverlay | None
-    mcap: RunMcap | None
-    rerun: RunRerun | None
-    net: NetPass | None
-
-    def write(self, *results: FrameResult) -> None:
-        """Write the results of frames, and scans of lost ones, in their order."""
-        self.folder.write(*(result.scan for result in results))
-        self.bare_lens.write(*results)
-        for result in results:
-            if self.overlay is not None:
-                self.overlay.write(result.frame, result.scan)
-            if self.rerun is not None:
-                self.rerun.write(result.frame, result.scan)
-            if self.mcap is not None:
-                self.mcap.write(result)
-            if self.net is not None and not result.is_lost:
-                self.net.add(result.scan)
+    others: tuple[WriteResult, ...]  # What was requested besides.
 
 
 def claim_outputs(request: RunRequest) -> ExitStack:
     """Make sure that the run can be written, and return its claims, to be closed at its end.
 
     Raises `OutputError` if it cannot, or its folder holds another that may not be replaced. Raises
-    `OptionError` if a file of Rerun is requested but cannot be.
+    `OptionError` if its own source would be replaced, or a file of Rerun is requested but cannot be
+    written.
     """
-    check_source_stays(request.out, request.source)
+    source, rerun = Path(request.source), request.rerun
+    is_ours = source.is_file() and source.name in RUN_FILES
+    if is_ours and source.resolve().parent == request.out.resolve():
+        raise OptionError(f"{source}: is what the run reads; write to another folder")
     with ExitStack() as claims:
-        if request.rerun is not None:
-            claims.callback(_claim_rerun(request.rerun, overwrite=request.overwrite).close)
+        if rerun is not None:
+            from aqualvs.recording.rerun_log import RRD, rerun_sdk
+
+            if rerun.suffix != RRD:
+                raise OptionError(f"--rerun {rerun}: give a file that ends in {RRD}")
+            rerun_sdk()
+            refuse_special(rerun, OutputError, f"give a file that ends in {RRD}")
+            claims.callback(Claim("run", [rerun], overwrite=request.overwrite).close)
         claims.callback(prepare_folder(request.out, overwrite=request.overwrite).close)
         return claims.pop_all()
-
-
-def _claim_rerun(path: Path, *, overwrite: bool) -> Claim:
-    from aqualvs.recording.rerun_log import RRD, rerun_sdk
-
-    if path.suffix != RRD:
-        raise OptionError(f"--rerun {path}: give a file that ends in {RRD}")
-    rerun_sdk()
-    refuse_special(path, OutputError, f"give a file that ends in {RRD}")
-    return Claim("run", [path], overwrite=overwrite)
 
 
 @contextmanager
@@ -282,14 +217,19 @@ def open_writers(
         summary=summary,
         shutter=rig.shutter,
     )
-    with (
-        folder,
-        RunOverlay(request.out, rig, source) if request.overlay else nullcontext() as overlay,
-        RunBareLens(request.out, rig) as bare_lens,
-        RunMcap(request.out, rig, request.scanner) if request.mcap else nullcontext() as mcap,
-        RunRerun(request.rerun, rig) if request.rerun else nullcontext() as rerun,
-    ):
-        yield RunWriters(folder, bare_lens, overlay, mcap, rerun, net)
+    with ExitStack() as stack:
+        stack.enter_context(folder)
+        others: list[WriteResult] = []
+        if request.overlay:
+            others.append(stack.enter_context(_overlay(request, rig, source)))
+        bare_lens = stack.enter_context(RunBareLens(request.out, rig))
+        if request.mcap:
+            others.append(stack.enter_context(_mcap(request, rig)))
+        if request.rerun:
+            others.append(stack.enter_context(_rerun(request.rerun, rig)))
+        if net is not None:
+            others.append(lambda result: None if result.is_lost else net.add(result.scan))
+        yield RunWriters(folder, bare_lens, tuple(others))
 
 
 def write_all(
@@ -297,7 +237,11 @@ def write_all(
 ) -> None:
     """Write all results until they end, or a signal stops the run."""
     for block in blocks:
-        writers.write(*block)
+        writers.folder.write(*(result.scan for result in block))
+        writers.bare_lens.write(*block)
+        for result in block:
+            for write in writers.others:
+                write(result)
         tick(len(block))
         if stop.caught:
             writers.folder.status = Status.INTERRUPTED

@@ -72,9 +72,7 @@ class SchemaWords:
         """Return one line on the fault to mend first; a misspelt key explains the missing one."""
         faults = error.errors(include_url=False)
         unknown = [fault for fault in faults if fault["type"] in ("extra_forbidden", "invalid_key")]
-        return self._sentence((unknown or faults)[0], model)
-
-    def _sentence(self, fault: ErrorDetails, model: type[BaseModel]) -> str:
+        fault = (unknown or faults)[0]
         place, kind = _place(fault["loc"]) or "the file", fault["type"]
         if kind == "extra_forbidden":
             return f"{place} is not a key of {self.file}; {_closest(fault['loc'], model)}"
@@ -86,10 +84,7 @@ class SchemaWords:
             )
         if kind == "missing":
             return self.missing(place, fault["loc"])
-        remedy = self._remedy(fault)
-        if kind == "literal_error":
-            remedy = f"write {fault['ctx']['expected']}"
-        return f"{place} is {shown(fault['input'])}; {remedy}"
+        return f"{place} is {shown(fault['input'])}; {self._remedy(fault)}"
 
     def missing(self, place: str, loc: tuple[int | str, ...]) -> str:
         """Return the sentence on a key that must be there."""
@@ -97,6 +92,8 @@ class SchemaWords:
 
     def _remedy(self, fault: ErrorDetails) -> str:
         kind, place = fault["type"], fault["loc"]
+        if kind == "literal_error":
+            return f"write {fault['ctx']['expected']}"
         ends = str(place[0]) if place else "", str(place[-1]) if place else ""
         if ends in self.remedies:
             return self.remedies[ends]
@@ -150,20 +147,10 @@ def validated(
     error: type[AqualvsError],
     words: SchemaWords | None = None,
 ) -> AnyPart:
-    """Return the content of a file as its schema.
+    """Return the content of a file, as read from YAML, as its schema.
 
-    Parameters
-    ----------
-    kind : type
-        What the file may hold.
-    content : object
-        As read from YAML.
-    source : object
-        How messages call the file.
-    error : type
-        What is raised on a fault, with one line: source, place, value, remedy.
-    words : SchemaWords, optional
-        Of messages on this kind of file.
+    `source` is how messages call the file, and `words` are those of messages on this kind of file.
+    Raises `error` on a fault, with one line: source, place, value, remedy.
     """
     try:
         return kind.model_validate(content)
@@ -173,21 +160,10 @@ def validated(
 
 
 def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
-    """Return the content of a file, checked key by key.
+    """Return the content of a file, checked key by key; `kind` is what it may hold.
 
-    Parameters
-    ----------
-    kind : type
-        What the file may hold.
-    key : str
-        First key of such a file, whose value is the version of its format.
-    version : int
-        Version that is read.
-
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    `key` is the first key of such a file, whose value is the version of its format; `version` is
+    that which is read. Raises `OptionError` with one line: file, place, value, remedy.
     """
     content = read_yaml(path, f"a file that begins with '{key}: {version}'", OptionError)
     return parse_settings(content, kind, key, version, str(path))

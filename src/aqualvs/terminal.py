@@ -61,7 +61,8 @@ class StopSignals(Closing):
 Tick: TypeAlias = Callable[[int], None]
 
 FIRST_RUN = "the first run on a machine compiles, which takes about a minute"
-"""Said until the first frame is done; compiled code is kept for the next run."""
+"""Said if the first frame takes long; compiled code is kept for the next run."""
+_SLOW_S = 3.0  # Time after which that is said.
 
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
 # Variables that declare any output a terminal (https://force-color.org).
@@ -83,17 +84,25 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
     """Show a progress bar; print lines instead where standard error is no terminal.
 
     The first line comes at once, the others after 10 s, 20 s, 40 s and so on: few in a log, however
-    long it takes. Inside `hidden_progress`, show nothing. `n_frames` is None where it is not known.
-    Yields what is to be called with the number of frames completed since the last call.
+    long it takes. If the first frame takes long, either says why. Inside `hidden_progress`, show
+    nothing. `n_frames` is None where it is not known. Yields what is to be called with the number
+    of frames completed since the last call.
     """
     if _HIDDEN.get():
-        yield _echo_nothing
+        yield lambda _: None
         return
     if not _may_be_terminal():
         units = unit.removesuffix("s") if n_frames == 1 else unit
         count = unit if n_frames is None else f"{n_frames} {units}"
-        _say(f"{label}: {count} ({FIRST_RUN})")
-        yield Lines(label, count if n_frames is None else f"of {count}").tick
+        _say(f"{label}: {count}")
+        lines = Lines(label, count if n_frames is None else f"of {count}")
+        with _called_if_slow(lambda: _say(f"{label}: {FIRST_RUN}"), _SLOW_S) as timer:
+
+            def tick_line(n_done: int) -> None:
+                timer.cancel()
+                lines.tick(n_done)
+
+            yield tick_line
         return
 
     with _bar(label, n_frames, unit) as tick:
@@ -128,12 +137,19 @@ def _say(words: str) -> None:
 
 
 @contextlib.contextmanager
-def told_if_slow(label: str, after_s: float = 3.0) -> Iterator[None]:
+def told_if_slow(label: str, after_s: float = _SLOW_S) -> Iterator[None]:
     """Say on standard error what is waited for, if it takes longer than `after_s` seconds."""
-    timer = threading.Timer(after_s, lambda: _say(f"{label} ({FIRST_RUN})"))
+    with _called_if_slow(lambda: _say(f"{label} ({FIRST_RUN})"), after_s):
+        yield
+
+
+@contextlib.contextmanager
+def _called_if_slow(tell: Callable[[], object], after_s: float) -> Iterator[threading.Timer]:
+    """Call a function after that time, unless the context ends or the timer is cancelled before."""
+    timer = threading.Timer(after_s, tell)
     timer.start()
     try:
-        yield
+        yield timer
     finally:
         timer.cancel()
 
@@ -146,10 +162,6 @@ def _may_be_terminal() -> bool:
         return sys.stderr.isatty()
     except (AttributeError, ValueError):
         return False
-
-
-def _echo_nothing(n_done: int) -> None:
-    """Do nothing."""
 
 
 @contextlib.contextmanager
@@ -168,13 +180,19 @@ def _bar(label: str, n_frames: int | None, unit: str) -> Iterator[Tick]:
         transient=True,
         disable=not stderr.is_terminal,
     ) as bar:
-        task = bar.add_task(f"{label} ({FIRST_RUN})", total=n_frames, rate="")
+        task = bar.add_task(label, total=n_frames, rate="")
 
-        def tick(n_done: int) -> None:
-            bar.update(task, advance=n_done, description=label)
-            bar.update(task, rate=rate_text(bar.tasks[0], unit))
+        def explain() -> None:
+            bar.update(task, description=f"{label} ({FIRST_RUN})")
 
-        yield tick
+        with _called_if_slow(explain, _SLOW_S) as timer:
+
+            def tick(n_done: int) -> None:
+                timer.cancel()
+                bar.update(task, advance=n_done, description=label)
+                bar.update(task, rate=rate_text(bar.tasks[0], unit))
+
+            yield tick
 
 
 def rate_text(task: "Task", unit: str) -> str:

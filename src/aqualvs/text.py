@@ -60,27 +60,18 @@ REASON_WORDS: dict[str, str] = {
     Reason.FROZEN: "picture stands still",
 }
 
-LABEL_WORDS: dict[Label, str] = {
-    Label.NET: "net",
-    Label.SOLID: "solid",
-    Label.FISH: "fish",
-    Label.BUBBLE: "bubble",
-    Label.BACKGROUND: "behind the target",
-    Label.CLUTTER: "clutter",
-    Label.AMBIGUOUS: "ambiguous",
-    Label.OUT_OF_RANGE: "out of range",
+_LABELS = {
+    Label.NET: ("net", "#009E73"),
+    Label.SOLID: ("solid", "#E69F00"),
+    Label.FISH: ("fish", "#D55E00"),
+    Label.BUBBLE: ("bubble", "#56B4E9"),
+    Label.BACKGROUND: ("behind the target", "#0072B2"),
+    Label.CLUTTER: ("clutter", "#555555"),
+    Label.AMBIGUOUS: ("ambiguous", "#CC79A7"),
+    Label.OUT_OF_RANGE: ("out of range", "#999999"),
 }
-
-LABEL_COLOURS: dict[Label, str] = {
-    Label.NET: "#009E73",
-    Label.SOLID: "#E69F00",
-    Label.FISH: "#D55E00",
-    Label.BUBBLE: "#56B4E9",
-    Label.BACKGROUND: "#0072B2",
-    Label.CLUTTER: "#555555",
-    Label.AMBIGUOUS: "#CC79A7",
-    Label.OUT_OF_RANGE: "#999999",
-}
+LABEL_WORDS = {label: words for label, (words, _) in _LABELS.items()}
+LABEL_COLOURS = {label: colour for label, (_, colour) in _LABELS.items()}
 
 # The first colours are visible on a dark green picture and on white paper.
 LASER_COLOURS = ("#E69F00", "#56B4E9", "#CC79A7", "#D55E00", "#0072B2", "#009E73", "#F0E442")

@@ -10,6 +10,7 @@ Parsing does not recurse, so that no file, however nested, exhausts the stack.
 import re
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -119,19 +120,9 @@ class _TextError(Exception):
 
 
 def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
-    """Return the content of a YAML file.
+    """Return the content of a YAML file; `what` is its kind in messages, such as "a rig file".
 
-    Parameters
-    ----------
-    what : str
-        Kind of the file in messages, such as "a rig file".
-    error : type
-        Exception to raise.
-
-    Raises
-    ------
-    AqualvsError
-        Of type `error`; one line that names the file, the line in it and the remedy.
+    Raises `error` with one line that names the file, the line in it and the remedy.
     """
     return parse_yaml(read_text(path, what, error), str(path), error)
 
@@ -164,19 +155,9 @@ def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
 
 
 def parse_yaml(text: str, source: str, error: type[AqualvsError]) -> Any:
-    """Return the content of a YAML text.
+    """Return the content of a YAML text; `source` is its name in messages.
 
-    Parameters
-    ----------
-    source : str
-        Name of the text in messages.
-    error : type
-        Exception to raise.
-
-    Raises
-    ------
-    AqualvsError
-        Of type `error`; one line that names the source, the line in it and the remedy.
+    Raises `error` with one line that names the source, the line in it and the remedy.
     """
     try:
         return _parse(text)
@@ -209,21 +190,19 @@ def _parse(text: str) -> Any:
     return builder.content
 
 
+@dataclass(slots=True, eq=False)
 class _Node:
     """A value under construction, or an anchored one."""
 
-    __slots__ = ("anchor", "count", "height", "key", "merged", "merges", "value")
-
-    def __init__(self, value: Any, anchor: str | None, *, count: int = 1, height: int = 0) -> None:
-        self.value = value
-        self.anchor = anchor
-        # Values that it holds, itself included, and levels of lists and mappings.
-        self.count = count
-        self.height = height
-        # Key of a mapping that waits for its value, or `_NO_KEY`, or `_MERGE` (`<<`).
-        self.key: Any = _NO_KEY
-        self.merges = False  # Whether it is `<<`, plain and without a tag.
-        self.merged: list[dict[Any, Any]] = []  # Mappings to fill up from.
+    value: Any
+    anchor: str | None
+    # Values that it holds, itself included, and levels of lists and mappings.
+    count: int = 1
+    height: int = 0
+    # Key of a mapping that waits for its value, or `_NO_KEY`, or `_MERGE` (`<<`).
+    key: Any = _NO_KEY
+    merges: bool = False  # Whether it is `<<`, plain and without a tag.
+    merged: Sequence[dict[Any, Any]] = ()  # Mappings to fill up from.
 
 
 class _Builder:
@@ -303,8 +282,14 @@ class _Builder:
             parent.value.append(node.value)
         elif parent.key is _NO_KEY:
             self._take_key(parent, node, line)
+        elif parent.key is not _MERGE:
+            parent.value[parent.key] = node.value
+            parent.key = _NO_KEY
         else:
-            self._take_value(parent, node, line)
+            merged = node.value if isinstance(node.value, list) else [node.value]
+            if parent.merged or not all(isinstance(one, dict) for one in merged):
+                raise _TextError("<< that is not a mapping, or appears twice", line)
+            parent.merged, parent.key = merged, _NO_KEY
 
     @staticmethod
     def _take_key(parent: _Node, node: _Node, line: int) -> None:
@@ -316,17 +301,6 @@ class _Builder:
             raise _TextError(f"key {_shown(node.value)} appears twice", line, "keep one of them")
         else:
             parent.key = node.value
-
-    @staticmethod
-    def _take_value(parent: _Node, node: _Node, line: int) -> None:
-        key, parent.key = parent.key, _NO_KEY
-        if key is not _MERGE:
-            parent.value[key] = node.value
-            return
-        merged = node.value if isinstance(node.value, list) else [node.value]
-        if parent.merged or not all(isinstance(one, dict) for one in merged):
-            raise _TextError("<< that is not a mapping, or appears twice", line)
-        parent.merged = merged
 
 
 def _scalar(event: yaml.ScalarEvent, line: int) -> Any:
@@ -419,8 +393,10 @@ def carry_comments(old: str, new: str) -> str:
         return new
     if len(comments) <= max_comments:
         carried = _carried(old, new, comments)
-        if _content(new) == _content(carried) and _holds(carried, comments):
-            return carried
+        if _content(new) == _content(carried):
+            found = "\n".join(one.text for one in _comments(carried))
+            if all(one.text in found for one in comments):
+                return carried
     lines = _BREAK.split(new)
     top = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return "\n".join([*lines[:top], *(one.text for one in comments), *lines[top:]])
@@ -431,11 +407,6 @@ def _content(text: str) -> str | None:
         return repr(parse_yaml(text, "", AqualvsError))
     except AqualvsError:
         return None
-
-
-def _holds(text: str, comments: list[_Comment]) -> bool:
-    found = "\n".join(one.text for one in _comments(text))
-    return all(one.text in found for one in comments)
 
 
 def _comments(text: str) -> list[_Comment]:
@@ -492,7 +463,11 @@ def _carried(old: str, new: str, comments: list[_Comment]) -> str:
     first: dict[_Place, int] = {}
     for line, _, place in _places(new):
         first.setdefault(place, line)
-    broken = _broken_lines(new)
+    # Lines that end within a value, in which # begins no comment.
+    broken: set[int] = set()
+    for token in yaml.scan(new, Loader=yaml.SafeLoader):
+        if isinstance(token, yaml.ScalarToken):
+            broken |= set(range(token.start_mark.line, token.end_mark.line))
     above: dict[int, list[str]] = {}
     behind: dict[int, list[str]] = {}
     for comment in comments:
@@ -512,15 +487,6 @@ def _carried(old: str, new: str, comments: list[_Comment]) -> str:
         result += [f"{indent}{one}" for one in above.get(number, [])]
         result.append("  ".join([text, *behind.get(number, [])]))
     return "\n".join(result)
-
-
-def _broken_lines(text: str) -> set[int]:
-    """Return the lines that end within a value, in which # begins no comment."""
-    found: set[int] = set()
-    for token in yaml.scan(text, Loader=yaml.SafeLoader):
-        if isinstance(token, yaml.ScalarToken):
-            found |= set(range(token.start_mark.line, token.end_mark.line))
-    return found
 
 
 def _owner(comment: _Comment, places: list[tuple[int, int, _Place]]) -> _Place | None:

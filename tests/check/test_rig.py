@@ -206,6 +206,10 @@ def test_what_makes_a_rig_useless(rig: Rig, words: str) -> None:
     [
         (pinhole(upright()), "One laser draws one line"),
         (pinhole(upright(), level(-0.25)), "'level' is in the picture only from"),
+        (
+            pinhole(upright(2e-3), level(-0.1)),
+            "'upright' passes the lens at 2 mm, so that its stripe hardly moves with range",
+        ),
         (replace(example_rig(), n_water=1.0003), "that of air"),
         (
             pinhole(upright(0.05), Laser("b", Plane.from_normal([1, 0, 0.1], -0.05))),
@@ -240,7 +244,17 @@ def test_what_makes_a_rig_useless(rig: Rig, words: str) -> None:
         ),
     ],
     ids=[
-        *("one", "near lost", "air", "narrow", "aside", "centre", "aspect", "lens ends"),
+        *(
+            "one",
+            "near lost",
+            "no depth",
+            "air",
+            "narrow",
+            "aside",
+            "centre",
+            "aspect",
+            "lens ends",
+        ),
         *("baseline", "exchanged"),
     ],
 )

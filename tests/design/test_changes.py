@@ -84,6 +84,16 @@ def test_freedom_helps_and_what_is_fixed_stays():
     assert best_angles(all_fixed) is all_fixed
 
 
+def test_a_turned_stripe_keeps_half_of_its_baseline():
+    """The best stripes of four lasers, but for that, include one that does not move with range."""
+    rig = replace(bluerov2_rig(), working_range=(0.2, 0.9))
+    design = design_of(rig, 4)
+    free = [replace(mount, stripe=0.5 * math.pi, free_stripe=True) for mount in design.mounts]
+    assert min(mount.baseline for mount in free) < 1e-9
+    for mount in best_angles(design.with_mounts(free)).mounts:
+        assert mount.baseline >= 0.5 * 0.15 - 1e-9
+
+
 def test_a_quick_search_ends_where_a_long_one_does_when_it_starts_nearby():
     best = best_angles(design_of(bluerov2_rig(), 3))
     again = best_angles(best, quick=True)

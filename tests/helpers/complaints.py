@@ -7,6 +7,6 @@ from aqualvs.terminal import FIRST_RUN
 
 def complaints(said: str) -> list[str]:
     """Return the lines but those of the progress, each with its line feed."""
-    later = re.compile(r"aqualvs: .*: \d+ .* after \d+ s\s*")
-    lines = said.splitlines(keepends=True)
-    return [line for line in lines if FIRST_RUN not in line and not later.fullmatch(line)]
+    first, later = r"aqualvs: .*: (\d+ )?(frames?|pictures?)", r"aqualvs: .*: \d+ .* after \d+ s"
+    progress = re.compile(rf"({first}|{later}|.*{FIRST_RUN}.*)\s*")
+    return [line for line in said.splitlines(keepends=True) if not progress.fullmatch(line)]

@@ -14,7 +14,7 @@ from agreement_cases import Diver, Target
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture, suspects_of
 from aqualvs.optics.rig import rig_moved_by
-from aqualvs.scanning.agreement import LaserAgreement
+from aqualvs.results.agreement import LaserAgreement
 from aqualvs.scanning.scan import ImagePlane
 from aqualvs.simulation.scenarios import example_rig
 from live_cases import demo_frames

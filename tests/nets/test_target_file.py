@@ -7,7 +7,7 @@ import pytest
 from aqualvs.errors import OptionError
 from aqualvs.nets.target_file import target_dict
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 
 
 @pytest.mark.parametrize("kind", list(TargetKind))

@@ -70,7 +70,7 @@ def test_rates_move_a_posture_by_what_the_same_pixels_read():
     rig = replace(example_rig(), shutter=_ROLLING)
     wall = WallView.ahead(rig, 0.6)
     times = np.concatenate([_ROLLING.row_times(one.pixels[:, 1], 576) for one in wall.stripes])
-    points, weights = wall._weighted(wall._points())
+    points, weights = wall._weighted(wall._points)
     for i, rate in enumerate(np.diag([0.3, 0.2, 0.2])):
         # Points of a plane that moves, put onto it along the view; small steps, so all is linear.
         step = 1e-4 * rate * times[:, None]

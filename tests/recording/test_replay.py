@@ -24,7 +24,7 @@ from aqualvs.results.run_request import FrameWindow, RunRequest, Water
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.scan import GyroRates
 from aqualvs.scanning.stripe import ThresholdOptions
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 from live_cases import demo_rig, demo_samples
 from repository import ROOT
 from whole import WHOLE

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from aqualvs.optics.rig import Rig, rig_moved_by
+from aqualvs.results.agreement import AgreementState, AgreementVerdict, LaserAgreement
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement
 from aqualvs.scanning.scan import Frame
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.sources import open_source

@@ -19,7 +19,7 @@ from aqualvs.scanning.paper.detector import PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.scan import Frame, Label, Scan
 from aqualvs.scanning.stripe import ThresholdOptions
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.render import RenderedFrame, Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig

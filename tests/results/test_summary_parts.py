@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.nets.target_file import NetCheck, NetFacts
+from aqualvs.results.agreement import LaserAgreement
 from aqualvs.results.summary import RunSummary
-from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.simulation.scenarios import example_rig

@@ -25,7 +25,8 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands, sample_bands
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, TargetKind, surface_on
+from aqualvs.scanning.surfaces import Surface, surface_on
+from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
 from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated
@@ -162,7 +163,7 @@ def test_a_stripe_that_crosses_a_rival_is_none_of_its_stripes() -> None:
     bands = plan_bands(rig, rig.camera())
     triangulator = Triangulator(rig, rig.camera())
     candidates = find_candidates(peaks_of(rig, [(wall, everywhere)]), bands, triangulator)
-    subsegments, _ = candidates.subsegments()
+    subsegments = candidates.linked().subsegments
     found = np.empty((2, N_MEASURES))
     judge_planes(
         np.stack([wall.packed(), rival.packed()]),
@@ -285,7 +286,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     def nearer_net(
         parts: list[dict[SearchAxis, StripePeaks]], *, share: float = 1.0, mesh: bool = True
     ) -> bool:
-        subsegments, _ = find_candidates(joined(parts), laser_bands, triangulator).subsegments()
+        subsegments = find_candidates(joined(parts), laser_bands, triangulator).linked().subsegments
         target, other = (
             surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (far, near)
         )
@@ -301,7 +302,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     net_mask = peaks_of(rig, [(far, strands)], 0.1)
     assert not nearer_net([parts[0], net_mask])
     scanner, peaks = Scanner(rig), joined(parts)
-    subsegments, _ = find_candidates(peaks, laser_bands, triangulator).subsegments()
+    subsegments = find_candidates(peaks, laser_bands, triangulator).linked().subsegments
     other = surface_on(near, subsegments, len(rig.lasers), 850.0)
     assert scanner.measure(0, 0.0, peaks).posture
     monkeypatch.setattr(assignment.AssignmentTest, "nearer_net", lambda *_: other)
@@ -360,10 +361,10 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
             {axis: one._replace(height=height * one.height) for axis, one in peaks.items()}
             for peaks in of_net
         ]
-        candidates = find_candidates(joined([*low, *loose]), laser_bands, triangulator)
-        subsegments, _ = candidates.subsegments()
+        linked = find_candidates(joined([*low, *loose]), laser_bands, triangulator).linked()
+        subsegments = linked.subsegments
         target = replace(surface_on(net, subsegments, len(rig.lasers), 850.0), is_mesh=True)
-        return test.is_by_chance(candidates, subsegments, [target], target)
+        return test.is_by_chance(linked, [target], target)
 
     # A third of the light, and an eighth of it on few strands.
     assert not is_chance(1, 1, 1)
@@ -399,10 +400,10 @@ def test_two_lasers_show_any_plane_evenly(one_of: int, is_chance: bool) -> None:
             parts.append(
                 peaks_of(replace(rig, lasers=(laser,)), [(elsewhere, slanted_strands)], 0.1)
             )
-    candidates = find_candidates(joined(parts), laser_bands, triangulator)
-    subsegments, _ = candidates.subsegments()
+    linked = find_candidates(joined(parts), laser_bands, triangulator).linked()
+    subsegments = linked.subsegments
     target = replace(surface_on(net, subsegments, len(rig.lasers), 850.0), is_mesh=True)
-    assert test.is_by_chance(candidates, subsegments, [target], target) is is_chance
+    assert test.is_by_chance(linked, [target], target) is is_chance
 
 
 def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -416,12 +417,12 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     def overlooked(
         part: dict[SearchAxis, StripePeaks], *, mesh: bool = True, wall_is_mesh: bool = False
     ) -> Surface | None:
-        candidates = find_candidates(joined([part, behind]), laser_bands, triangulator)
-        subsegments, _ = candidates.subsegments()
+        linked = find_candidates(joined([part, behind]), laser_bands, triangulator).linked()
+        subsegments = linked.subsegments
         near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
         near, far = replace(near, is_mesh=mesh), replace(far, is_mesh=wall_is_mesh)
-        assert test.overlooked(candidates, subsegments, [far, near], near) is None
-        return test.overlooked(candidates, subsegments, [far, near], far)
+        assert test.overlooked(linked, [far, near], near) is None
+        return test.overlooked(linked, [far, near], far)
 
     seen = peaks_of(rig, [(net, slanted_strands)], 0.1)
     found = overlooked(seen)
@@ -444,7 +445,7 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     # The wall in its shadows may look broken, and has long stretches all the same.
     assert overlooked(seen, wall_is_mesh=True) is not None
     scanner, peaks = Scanner(rig), joined([seen, behind])
-    monkeypatch.setattr("aqualvs.scanner.choose_target", lambda surfaces, *_: surfaces[0])
+    monkeypatch.setattr("aqualvs.scanning.target.choose_target", lambda surfaces, *_: surfaces[0])
     posture = scanner.measure(0, 0.0, peaks).posture
     assert isinstance(posture, Posture)
     assert posture.range == pytest.approx(0.4 / np.hypot(0.1, 1.0), rel=2e-3)
@@ -470,13 +471,13 @@ def test_a_net_before_a_wall_that_its_shadows_break_is_not_overlooked(share: flo
     camera = rig.camera()
     laser_bands, triangulator = plan_bands(rig, camera), Triangulator(rig, camera)
     seen = [peaks_of(rig, [one], 0.1) for one in ((net, strands), (wall, between_strands))]
-    candidates = find_candidates(joined(seen), laser_bands, triangulator)
-    subsegments, _ = candidates.subsegments()
+    linked = find_candidates(joined(seen), laser_bands, triangulator).linked()
+    subsegments = linked.subsegments
     near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
     far = replace(far, is_mesh=True, is_unbroken=False, extent=near.extent)
     near = replace(near, extent=share * near.extent)
     test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
-    found = test.overlooked(candidates, subsegments, [far, near], far)
+    found = test.overlooked(linked, [far, near], far)
     assert (found is not None) == (share == 1.0)
 
 

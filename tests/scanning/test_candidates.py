@@ -111,7 +111,7 @@ def test_sigma_grows_with_width_over_height() -> None:
 def test_chunks_are_centroids_and_their_errors_shrink() -> None:
     rig = example_rig()
     candidates = read(rig, peaks_of(rig, [(WALL, strands)], noise_px=0.1))
-    subsegments, _ = candidates.subsegments()
+    subsegments = candidates.linked().subsegments
     index = subsegments.of_candidate
     assert index.shape == (candidates.n,)
     assert np.all(np.diff(index) >= 0)
@@ -179,7 +179,7 @@ def test_nothing_in_nothing_out() -> None:
     }
     candidates = read(rig, nothing)
     assert candidates.n == 0
-    subsegments, _ = candidates.subsegments()
+    subsegments = candidates.linked().subsegments
     index = subsegments.of_candidate
     assert subsegments.n == len(index) == 0
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
+from aqualvs.scanning.candidates import Candidates, LinkedCandidates, Subsegments, find_candidates
 from aqualvs.scanning.labels import label_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Reason, Refusal
@@ -42,7 +42,8 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
     camera = rig.camera()
     peaks = peaks_of(rig, targets, 0.1)
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
-    subsegments, shapes = candidates.subsegments()
+    linked = candidates.linked()
+    subsegments = linked.subsegments
     surfaces = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
     target = None
     in_posture = np.zeros(candidates.n, np.bool_)
@@ -50,10 +51,9 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
         offsets = [abs(one.plane.offset - posture_to.offset) for one in surfaces]
         target = surfaces[int(np.argmin(offsets))]
         in_posture = target.members[subsegments.of_candidate]
-    points, _ = label_candidates(
-        candidates, subsegments, shapes, surfaces, target, Measurement(NONE, in_posture), RANGE
-    )
-    return Labelled(peaks, candidates, subsegments, shapes, surfaces, points)
+    found = Measurement(NONE, in_posture)
+    points, _ = label_candidates(linked, surfaces, target, found, RANGE)
+    return Labelled(peaks, *linked, surfaces, points)
 
 
 def all_pixels(peaks: dict[SearchAxis, StripePeaks]) -> FloatArray:
@@ -126,9 +126,7 @@ def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
     on_it = target.members[found.subsegments.of_candidate]
     left_out = on_it & (found.candidates.pixels[:, 1] < 200.0)
     points, _ = label_candidates(
-        found.candidates,
-        found.subsegments,
-        found.shapes,
+        LinkedCandidates(found.candidates, found.subsegments, found.shapes),
         found.surfaces,
         target,
         Measurement(NONE, on_it & ~left_out),
@@ -144,9 +142,7 @@ def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
 def test_short_pieces_that_nothing_explains_are_clutter_or_ambiguous() -> None:
     found = label([(NET, strands)], None)
     points, _ = label_candidates(
-        found.candidates,
-        found.subsegments,
-        found.shapes,
+        LinkedCandidates(found.candidates, found.subsegments, found.shapes),
         [],
         None,
         Measurement(NONE, np.zeros(found.candidates.n, np.bool_)),

@@ -16,7 +16,7 @@ from aqualvs.live.runner import wall_frame
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.scan import Frame, Scan
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources import open_source
 from lazy_cases import lazy_kernels

@@ -12,7 +12,8 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, TargetKind, choose_target, find_surfaces, surface_on
+from aqualvs.scanning.surfaces import Surface, find_surfaces, surface_on
+from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import Lit, everywhere, peaks_of, strands
@@ -47,7 +48,7 @@ def surfaces_of(
     candidates = find_candidates(
         peaks_of(rig, targets, noise_px), plan_bands(rig, camera), Triangulator(rig, camera)
     )
-    subsegments, _ = candidates.subsegments()
+    subsegments = candidates.linked().subsegments
     found = find_surfaces(
         subsegments,
         candidates.pixels,
@@ -202,7 +203,7 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
         )
     camera = rig.camera()
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
-    subsegments, _ = candidates.subsegments()
+    subsegments = candidates.linked().subsegments
     found = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
     # Chance puts some specks on a plane, never a fifth of them.
     assert all(surface.n_lines < 0.2 * candidates.n for surface in found)
@@ -294,11 +295,15 @@ def test_light_far_behind_a_plane_is_not_on_it_however_far_a_pixel_moves_it() ->
     """Read as the wrong laser's, a neighbour's light lies where rays are parallel to the sheet."""
     wall = plane(0.5)
     rig, camera = example_rig(), example_rig().camera()
-    subsegments = find_candidates(
-        peaks_of(rig, [(wall, everywhere)], NOISE_PX),
-        plan_bands(rig, camera),
-        Triangulator(rig, camera),
-    ).subsegments()[0]
+    subsegments = (
+        find_candidates(
+            peaks_of(rig, [(wall, everywhere)], NOISE_PX),
+            plan_bands(rig, camera),
+            Triangulator(rig, camera),
+        )
+        .linked()
+        .subsegments
+    )
     last = subsegments.n - 1
     table = subsegments.table.copy()
     place = table[:3, last].copy()

@@ -4,7 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,11 +19,9 @@ from aqualvs.batch.summary_page import SUMMARY_HTML, write_summary
 from aqualvs.batch.work import DiveWork, size_of
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.results.files import AppendFile, Claim, is_locked, read_json, replace_text, writing
-from aqualvs.results.run_request import RunRequest, Water
-from aqualvs.scanner import ScannerOptions
+from aqualvs.results.run_request import RunRequest
 from aqualvs.terminal import Echo, StopSignals
 from aqualvs.text import count_text
 
@@ -38,20 +36,11 @@ class BatchRequest:
     """Request for a batch: dives, rig, options and the folder to write."""
 
     dives: tuple[str, ...]  # As `find_dives` takes them.
-    out: Path  # Folder to write, or of an earlier batch to go on with.
-    rig: Path | None = None  # As `find_dives` takes it.
-    water: Water = field(default_factory=Water)
+    # Run of every dive, but for its source, its own rig, water and log, and its folder in `out`,
+    # which is that of the batch: to write, or of an earlier batch to go on with.
+    run: RunRequest
     scheduler: str | None = None  # Address of a Dask scheduler; None works on this machine.
     n_workers: int | None = None  # Processes on this machine; None for one per core.
-    no_dome: bool = False
-    fps: float | None = None  # Of folders of images.
-    scanner: ScannerOptions = field(default_factory=ScannerOptions)
-    chosen: frozenset[str] | None = None  # As in `RunRequest`.
-    target: str = "auto"
-    index_target: Path | None = None
-    report: bool = True  # Whether each dive gets its report.
-    # What to find out about the net of each dive, if anything; logs are those of the dives.
-    net: NetRequest | None = None
 
 
 def batch(request: BatchRequest, echo: Echo) -> int:
@@ -63,21 +52,22 @@ def batch(request: BatchRequest, echo: Echo) -> int:
     be begun: no such dive, a dive without a rig, a folder that cannot be written, no workers.
     """
     _check(request)
-    dives = find_dives(request.dives, rig=request.rig, water=request.water, out=request.out)
+    run, out = request.run, request.run.out
+    dives = find_dives(request.dives, rig=run.rig, water=run.water, out=out)
     # What an earlier batch of this folder has finished is gone on with, not replaced.
-    files = [request.out / name for name in (SUMMARY_HTML, DIVES, DATASET)]
-    known = files if (request.out / HOME).is_dir() else []
+    files = [out / name for name in (SUMMARY_HTML, DIVES, DATASET)]
+    known = files if (out / HOME).is_dir() else []
     claim = Claim("batch", files, overwrite=True, known=known)
-    with writing(request.out):
-        (request.out / HOME).mkdir(parents=True, exist_ok=True)
-    lock = request.out / HOME / _LOCK
+    with writing(out):
+        (out / HOME).mkdir(parents=True, exist_ok=True)
+    lock = out / HOME / _LOCK
     if is_locked(lock):
-        raise OutputError(f"{request.out}: another batch is running here; wait for it to end")
+        raise OutputError(f"{out}: another batch is running here; wait for it to end")
     with writing(lock):
         held = AppendFile(lock)
         held.lock()
     with closing(held):
-        with writing(request.out):
+        with writing(out):
             works = _works(request, dives)
         with (
             StopSignals() as stop,
@@ -88,16 +78,18 @@ def batch(request: BatchRequest, echo: Echo) -> int:
                 workers.check_access(lock)
             sized = [(work, size_of(Path(work.request.source))) for work in works]
             found = Scheduler(sized, workers, progress).run(lambda: stop.caught is not None)
-        records = _all_records(request.out, found)
-        with writing(request.out):
-            _tidy(request.out / HOME)
-            (request.out / DATASET).mkdir(exist_ok=True)
-            write_dives(request.out / DATASET, [record.row() for record in records])
-        for line in _summary_lines(
-            request, found, stopped_by=stop.caught.name if stop.caught else ""
-        ):
+        records = _all_records(out, found)
+        with writing(out):
+            # What processes left that were killed.
+            for path in list((out / HOME).rglob("*.part")):
+                clear(path)
+                if path.is_file():
+                    path.unlink(missing_ok=True)
+            (out / DATASET).mkdir(exist_ok=True)
+            write_dives(out / DATASET, [record.row() for record in records])
+        for line in _summary_lines(out, found, stop.caught.name if stop.caught else ""):
             echo(line)
-        echo(f"summary: {write_summary(request.out, records)}")
+        echo(f"summary: {write_summary(out, records)}")
     claim.close()
     if stop.caught:
         return stop.exit_code
@@ -107,8 +99,8 @@ def batch(request: BatchRequest, echo: Echo) -> int:
 def _check(request: BatchRequest) -> None:
     if not request.dives:
         raise OptionError("DIVES: missing; name videos, folders, patterns or a list of dives")
-    if request.rig is not None:
-        load_rig(request.rig)
+    if request.run.rig is not None:
+        load_rig(request.run.rig)
     if request.scheduler is not None and request.n_workers is not None:
         raise OptionError("--workers: the scheduler has its own workers; leave one of them out")
     if request.n_workers is not None and request.n_workers < 1:
@@ -117,7 +109,7 @@ def _check(request: BatchRequest) -> None:
 
 def _works(request: BatchRequest, dives: Sequence[Dive]) -> list[DiveWork]:
     """Return the work for each dive, under the name that it has in the folder for good."""
-    out = request.out.resolve()
+    out = request.run.out.resolve()
     known = _with_moved(_known_names(out), dives, out)
     names = name_dives([(dive.source, dive.name) for dive in dives], known)
     known |= {str(dive.source): name for dive, name in zip(dives, names, strict=True)}
@@ -126,22 +118,18 @@ def _works(request: BatchRequest, dives: Sequence[Dive]) -> list[DiveWork]:
 
 
 def _work(request: BatchRequest, dive: Dive, name: str, out: Path) -> DiveWork:
-    index_target = request.index_target
-    run = RunRequest(
+    run = request.run
+    own = replace(
+        run,
         source=str(dive.source),
         rig=dive.rig,
         out=out / DIVES / name,
         water=dive.water,
-        no_dome=request.no_dome,
-        fps=request.fps if dive.source.is_dir() else None,
-        scanner=request.scanner,
-        chosen=request.chosen,
-        report=request.report,
-        index_target=None if index_target is None else index_target.resolve(),
-        target=request.target,
-        net=request.net and replace(request.net, log=dive.log, log_offset_s=dive.log_offset_s),
+        fps=run.fps if dive.source.is_dir() else None,
+        index_target=None if run.index_target is None else run.index_target.resolve(),
+        net=run.net and replace(run.net, log=dive.log, log_offset_s=dive.log_offset_s),
     )
-    return DiveWork(name=name, request=run, home=out / HOME / DIVES / name, dataset=out / DATASET)
+    return DiveWork(name=name, request=own, home=out / HOME / DIVES / name, dataset=out / DATASET)
 
 
 def _known_names(out: Path) -> dict[str, str]:
@@ -178,14 +166,6 @@ def _finished(out: Path, name: str) -> dict[str, Any] | None:
     return read_manifest(out / HOME / DIVES / name / JOINED)
 
 
-def _tidy(home: Path) -> None:
-    """Remove what processes left that were killed."""
-    for path in list(home.rglob("*.part")):
-        clear(path)
-        if path.is_file():
-            path.unlink(missing_ok=True)
-
-
 def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]:
     """Return how all dives of the folder stand, those of earlier batches too, by name."""
     records = dict(found)
@@ -197,9 +177,7 @@ def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]
     return [records[name] for name in sorted(records, key=str.casefold)]
 
 
-def _summary_lines(
-    request: BatchRequest, found: Mapping[str, DiveRecord], stopped_by: str
-) -> list[str]:
+def _summary_lines(out: Path, found: Mapping[str, DiveRecord], stopped_by: str) -> list[str]:
     counts = Counter(record.state for record in found.values())
     lines = [
         f"{count_text(len(found), 'dive')}: "
@@ -209,7 +187,7 @@ def _summary_lines(
         lines.append(
             f"stopped by {stopped_by}; finished work is kept; run the same command to resume"
         )
-    return [*lines, f"data set: {request.out / DATASET}"]
+    return [*lines, f"data set: {out / DATASET}"]
 
 
 class BatchProgress(Closing):

@@ -39,23 +39,10 @@ def write_manifest(
     names: Sequence[str],
     place: Path | None = None,
 ) -> None:
-    """Declare files in a folder finished.
+    """Declare the files `names` finished, which are in `place`, or else in `folder`.
 
-    Parameters
-    ----------
-    key : str
-        What the files were made from.
-    facts : mapping
-        To be had back; ready for JSON.
-    names : sequence of str
-        The files, which are read for their checksums.
-    place : Path or None
-        Where the files are, if not in `folder`.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `key` says what they were made from. `facts`, ready for JSON, are kept with the checksums of the
+    files, which are read for them. Raises `OSError` as the system says it.
     """
     files = {name: _fingerprint((place or folder) / name) for name in names}
     content = {"key": key, "files": files, "facts": dict(facts)}
@@ -65,14 +52,7 @@ def write_manifest(
 def read_valid_manifest(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] | None:
     """Return the facts of finished work, None unless it is there, made for `key`, and intact.
 
-    Parameters
-    ----------
-    folder : Path
-        With the seal.
-    key : str
-        As in `write_manifest`.
-    place : Path or None
-        Where the files are, if not in `folder`.
+    `folder` has the seal; `key` and `place` are as in `write_manifest`.
     """
     content = read_manifest(folder)
     if content is None or content["key"] != key:
@@ -204,17 +184,7 @@ def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
 def put_net(dataset: Path, name: str, folder: Path) -> None:
     """Put the state of a dive's net into the data set, in place of what is there of this dive.
 
-    Parameters
-    ----------
-    name : str
-        Of the dive.
-    folder : Path
-        With `net.csv` and `holes.csv`.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `folder` holds `net.csv` and `holes.csv`. Raises `OSError` as the system says it.
     """
     for table in OF_NET:
         _put_table(dataset, name, folder / table, null_words=True)
@@ -231,8 +201,8 @@ def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
         parquet.write_table(table, draft, compression="zstd")
 
 
-def _table(path: Path, *, null_words: bool) -> Any:
-    """Return a CSV file as a table; numbers that are not there are null, and words if wanted."""
+def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> None:
+    """Put a CSV file into the data set; numbers that are not there are null, words if wanted."""
     with path.open(encoding="utf-8") as file:
         columns = file.readline().rstrip("\n").split(",")
     convert = csv.ConvertOptions(
@@ -244,12 +214,9 @@ def _table(path: Path, *, null_words: bool) -> Any:
     )
     # One thread: the process has one core to itself.
     read = csv.ReadOptions(use_threads=False)
-    return csv.read_csv(path, read_options=read, convert_options=convert)
-
-
-def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> None:
     with _replacing(_partition(dataset, name, path.name)) as draft:
-        parquet.write_table(_table(path, null_words=null_words), draft, compression="zstd")
+        table = csv.read_csv(path, read_options=read, convert_options=convert)
+        parquet.write_table(table, draft, compression="zstd")
 
 
 def holds(dataset: Path, name: str, tables: Iterable[str]) -> bool:

@@ -15,6 +15,7 @@ list.
 
 import csv
 import glob
+import itertools
 import math
 import re
 import unicodedata
@@ -40,27 +41,19 @@ _LONGEST = 80
 def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) -> list[str]:
     """Return a unique name for every dive, also on file systems that ignore case.
 
-    Parameters
-    ----------
-    sources : sequence of (Path, str)
-        Where a dive is, and the name that the user gives it, if any. A dive without is named after
-        its file; where that is taken, with the folders before it, as many as it needs.
-    known : mapping
-        Source to the name that an earlier batch in the same folder gave it, and which stays.
+    They begin with a letter, so that no reader takes them for numbers or dates, and hold letters,
+    digits, dots, underscores and hyphens.
 
-    Returns
-    -------
-    names : list of str
-        They begin with a letter, so that no reader takes them for numbers or dates, and hold
-        letters, digits, dots, underscores and hyphens.
+    `sources`: where a dive is, and the name that the user gives it, if any. A dive without is named
+    after its file; where that is taken, with the folders before it, as many as it needs. `known`:
+    by source, the name that an earlier batch in the same folder gave it, and which stays.
 
-    Raises
-    ------
-    OptionError
-        If the user gives one name to two dives.
+    Raises `OptionError` if the user gives one name to two dives.
     """
     names = {
-        str(path): known[str(path)] for path, given in sources if _keeps_name(path, given, known)
+        str(path): known[str(path)]
+        for path, given in sources
+        if str(path) in known and (not given or safe_name(given) == known[str(path)])
     }
     for path, given in sources:
         if given:
@@ -85,10 +78,6 @@ def safe_name(text: str) -> str:
     return text if text[:1].isalpha() else f"dive_{text}".rstrip("_")
 
 
-def _keeps_name(path: Path, given: str, known: Mapping[str, str]) -> bool:
-    return str(path) in known and (not given or safe_name(given) == known[str(path)])
-
-
 def _unique_names(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
     """Return names after the files; those that clash all get more of their path."""
     used, names = set(taken), dict.fromkeys(paths, "")
@@ -103,7 +92,9 @@ def _unique_names(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
         used |= {_folded(name) for name in names.values() if name}
         waiting = [path for path in waiting if not names[path]]
     for path in waiting:
-        names[path] = _numbered(_name_with_folders(path, deepest), used)
+        name = _name_with_folders(path, deepest)
+        numbered = (f"{name}-{number}" for number in itertools.count(2))
+        names[path] = next(one for one in numbered if _folded(one) not in used)
         used.add(_folded(names[path]))
     return [names[path] for path in paths]
 
@@ -113,13 +104,6 @@ def _name_with_folders(path: Path, depth: int) -> str:
     own = path.name if path.is_dir() else path.stem
     # The file's own end must outlive the cut.
     return safe_name("_".join([*folders[len(folders) - depth + 1 :], own])[-_LONGEST:])
-
-
-def _numbered(name: str, used: Collection[str]) -> str:
-    number = 2
-    while _folded(f"{name}-{number}") in used:
-        number += 1
-    return f"{name}-{number}"
 
 
 def _folded(name: str) -> str:
@@ -217,7 +201,6 @@ def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float 
 
 
 RIG_YAML = "rig.yaml"
-_RECORDING = ".mcap"
 
 
 def find_dives(
@@ -295,8 +278,11 @@ def _dives_in(folder: Path, out: Path | None) -> list[Path]:
     for path in _visible(folder):
         if own is not None and path.resolve().is_relative_to(own):
             continue
+        suffix = path.suffix.lower()
+        is_dive = suffix in VIDEO_SUFFIXES and path.is_file()
+        is_dive |= suffix == ".mcap" and is_recording(path)
         # What a run has written about a dive is no other dive.
-        if _is_dive(path) and not (path.parent / RUN_YAML).exists():
+        if is_dive and not (path.parent / RUN_YAML).exists():
             found.append(path)
     folders = [folder, *(path for path in _visible(folder) if path.is_dir())]
     found = found or [
@@ -320,13 +306,6 @@ def _visible(folder: Path) -> list[Path]:
         if not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
     return sorted(found, key=natural_key)
-
-
-def _is_dive(path: Path) -> bool:
-    suffix = path.suffix.lower()
-    if suffix == _RECORDING:
-        return is_recording(path)
-    return suffix in VIDEO_SUFFIXES and path.is_file()
 
 
 def _log_of(source: Path, given: Path | None) -> Path | None:

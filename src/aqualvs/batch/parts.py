@@ -49,7 +49,6 @@ from aqualvs.results.folder import (
 )
 from aqualvs.results.points import PointsStream, export_points, read_points_stream
 from aqualvs.results.run_request import FrameWindow, RunFile, Status
-from aqualvs.results.summary import RunSummary
 from aqualvs.run_outputs import RunBareLens
 from aqualvs.scanning.row_motion import REACH
 from aqualvs.scanning.scan import Frame
@@ -227,17 +226,6 @@ def _scanner(dive: OpenDive, probe: DiveProbe) -> FrameScanner:
     return _LAST.scanner
 
 
-def joined_summary(dive: OpenDive, pieces: Sequence[Path]) -> RunSummary:
-    """Return the summary that a run of the whole dive would have gathered.
-
-    `pieces`: folders of all pieces, in order.
-    """
-    summary = summary_for(dive)
-    for piece in pieces:
-        summary.extend(piece / SUMMARY)
-    return summary
-
-
 JOINED = "joined"
 """Folder, below a dive's home, with the seal of its result."""
 
@@ -264,22 +252,9 @@ def finished_dive(work: DiveWork, probe: DiveProbe) -> dict[str, Any] | None:
 def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
     """Join the pieces of a dive, write its report, and drop the pieces.
 
-    Parameters
-    ----------
-    results : sequence of PieceResult
-        Of all pieces, in order.
-
-    Returns
-    -------
-    facts : dict
-        Of the dive, for the summary; ready for JSON.
-
-    Raises
-    ------
-    PieceLostError
-        If a piece must be measured again.
-    AqualvsError
-        If the dive's folder cannot be written.
+    `results` are of all pieces, in order. Returns the facts of the dive, for the summary; ready for
+    JSON. Raises `PieceLostError` if a piece must be measured again, and `AqualvsError` if the
+    dive's folder cannot be written.
     """
     pieces = [piece_folder(work, probe, number) for number in range(len(probe.spans))]
     for number, piece in enumerate(pieces):
@@ -315,7 +290,9 @@ def _write_run_file(
 ) -> dict[str, Any]:
     """Write `run.yaml`; returns the facts of the dive."""
     with open_dive(work.request) as dive:
-        summary = joined_summary(dive, pieces)
+        summary = summary_for(dive)
+    for piece in pieces:
+        summary.extend(piece / SUMMARY)
     fault, facts, rig = results[-1].fault, summary.to_dict(), rig_to_mapping(dive.rig)
     run_file = RunFile(folder / RUN_YAML, probe.source, rig, dive.request.to_dict())
     run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=facts)
@@ -339,24 +316,21 @@ def _join_files(pieces: Sequence[Path], folder: Path) -> None:
     """Write rows and points of all pieces as those of one run."""
     for name in (POSTURE_CSV, POSTURE_BARE_CSV):
         parts = [piece / name for piece in pieces if (piece / name).exists()]
-        if parts:
-            _join_rows(parts, folder / name)
+        if not parts:
+            continue
+        # Rows of all under the head of the first.
+        with (folder / name).open("wb") as whole:
+            for number, part in enumerate(parts):
+                with part.open("rb") as rows:
+                    head = rows.readline()
+                    if number == 0:
+                        whole.write(head)
+                    shutil.copyfileobj(rows, whole)
     export_points(
         (batch for piece in pieces for batch in read_points_stream(piece / POINTS_STREAM)),
         folder / POINTS_PARQUET,
         folder / POINTS_PLY,
     )
-
-
-def _join_rows(parts: Sequence[Path], path: Path) -> None:
-    """Write the rows of several CSV files under the head of the first."""
-    with path.open("wb") as whole:
-        for number, part in enumerate(parts):
-            with part.open("rb") as rows:
-                head = rows.readline()
-                if number == 0:
-                    whole.write(head)
-                shutil.copyfileobj(rows, whole)
 
 
 def _replace_run(draft: Path, out: Path) -> list[str]:

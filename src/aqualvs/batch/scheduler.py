@@ -9,6 +9,7 @@ Where the condition of the net is wanted, it is evaluated from the finished run 
 something that it depends on changes.
 """
 
+import importlib
 import logging
 import os
 import queue
@@ -83,21 +84,18 @@ class WorkersGoneError(AqualvsError):
 class DaskWorkers(Closing):
     """Workers of a Dask scheduler; a context manager.
 
-    Parameters
-    ----------
-    n_workers : int or None
-        Processes on this machine, each with one thread; None for one per core.
-    scheduler : str or None
-        Address of a scheduler whose workers are used instead.
-
-    Raises
-    ------
-    OptionError
-        If `distributed` is missing, or the scheduler does not answer.
+    `n_workers`: processes on this machine, each with one thread; None for one per core.
+    `scheduler`: address of a scheduler whose workers are used instead. Raises `OptionError` if
+    `distributed` is missing, or the scheduler does not answer.
     """
 
     def __init__(self, n_workers: int | None = None, scheduler: str | None = None) -> None:
-        distributed = _distributed()
+        try:
+            distributed: Any = importlib.import_module("distributed")
+        except ImportError as fault:
+            raise OptionError(
+                "aqualvs batch needs distributed; install it with pip install 'aqualvs[batch]'"
+            ) from fault
         self._killed: type[BaseException] = distributed.KilledWorker
         self._n_slots, self._count_again_s, self._seen_s = 1, 0.0, time.monotonic()
         self._ended: queue.SimpleQueue[tuple[object, Any]] = queue.SimpleQueue()
@@ -189,16 +187,6 @@ class DaskWorkers(Closing):
             self._cluster.close(timeout=_TIMEOUT_S)
 
 
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError as fault:
-        raise OptionError(
-            "aqualvs batch needs distributed; install it with pip install 'aqualvs[batch]'"
-        ) from fault
-    return distributed
-
-
 def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
     import dask
     from dask.system import CPU_COUNT
@@ -247,18 +235,9 @@ NET = "net"
 def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return a finished dive's facts with the condition of its net, evaluated now if it is wanted.
 
-    Parameters
-    ----------
-    key : str
-        Of the dive's result, `DiveProbe.key`.
-    facts : mapping
-        From `join_dive`.
-
-    Returns
-    -------
-    facts : dict
-        With `net`, as `net_dict` has it, where it is known, or with `net_fault`, which says why
-        not. The dive's own result stands in any case.
+    `key` is that of the dive's result, `DiveProbe.key`, and `facts` are from `join_dive`. Added is
+    `net`, as `net_dict` has it, where it is known, or `net_fault`, which says why not. The dive's
+    own result stands in any case.
     """
     request = work.request.net
     if request is None:
@@ -274,12 +253,7 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 def known_net(home: Path, key: str) -> dict[str, Any]:
     """Return the stored condition of a dive's net, as from `with_net`; empty if there is none.
 
-    Parameters
-    ----------
-    home : Path
-        Of the dive.
-    key : str
-        Of its result; what was told of another does not count.
+    `home` is the dive's, `key` its result's; what was told of another result does not count.
     """
     found = read_manifest(home / NET)
     if found is None or not str(found["key"]).startswith(f"{key}-"):
@@ -379,12 +353,8 @@ class Steps:
 class Scheduler:
     """Scheduler that measures many dives with many processes.
 
-    Parameters
-    ----------
-    works : sequence of (DiveWork, int)
-        The dives with the sizes of their sources in bytes, in the order in which they are begun.
-    steps : Steps, optional
-        In place of the real ones.
+    `works` are the dives with the sizes of their sources in bytes, in the order in which they are
+    begun, and `steps` stand in place of the real ones.
     """
 
     def __init__(
@@ -402,17 +372,9 @@ class Scheduler:
         self.records: dict[str, DiveRecord] = {}
 
     def run(self, is_stopped: Callable[[], bool]) -> dict[str, DiveRecord]:
-        """Work until all is done, or it is stopped.
+        """Work until all is done, or `is_stopped`, which is asked several times a second.
 
-        Parameters
-        ----------
-        is_stopped : callable
-            Asked several times a second.
-
-        Returns
-        -------
-        records : dict
-            Name to how the dive stands, of all dives.
+        Returns how all dives stand, by name.
         """
         for dive in self._dives:
             self._observer.expect(dive.n_bytes)
@@ -457,18 +419,16 @@ class Scheduler:
         if outcome.error is not None:
             self._handle_error(task.dive, outcome.error)
         elif (found := task.dive.probe) is None:
-            self._probed(task.dive, *outcome.value)
+            found, facts = outcome.value
+            self._expect(task.dive, found.n_bytes)
+            if facts is None:
+                self._measure(task.dive, found)
+            else:
+                self._finish(task.dive, facts, reused=True)
         elif task.piece is not None:
             self._measured(task.dive, found, task.piece, outcome.value)
         else:
             self._finish(task.dive, outcome.value, reused=False)
-
-    def _probed(self, dive: _Dive, found: DiveProbe, facts: dict[str, Any] | None) -> None:
-        self._expect(dive, found.n_bytes)
-        if facts is None:
-            self._measure(dive, found)
-        else:
-            self._finish(dive, facts, reused=True)
 
     def _measured(self, dive: _Dive, found: DiveProbe, piece: int, result: PieceResult) -> None:
         dive.results[piece] = result
@@ -491,7 +451,10 @@ class Scheduler:
         again = dive.n_attempts < max_attempts
         if isinstance(error, SpanMismatchError) and dive.probe is not None:
             if not dive.probe.is_whole:
-                return self._measure_whole(dive, dive.probe, str(error))
+                dive.n_attempts += 1
+                dive.results.clear()
+                self._expect(dive, dive.probe.n_bytes)
+                return self._measure(dive, dive.probe.in_one_piece(str(error)))
         elif isinstance(error, PieceLostError | WorkersLostError) and again:
             dive.probe = None
             return self._start(dive)
@@ -499,13 +462,6 @@ class Scheduler:
         words = str(error) if foreseen else f"{type(error).__name__}: {error}"
         drop(dive.work.dataset, dive.work.name, (*OF_DIVE, *OF_NET))
         return self._end(dive, _record(dive, DiveState.FAILED, words))
-
-    def _measure_whole(self, dive: _Dive, found: DiveProbe, why: str) -> None:
-        """Measure a dive in one piece after its pieces turned out to be unusable."""
-        dive.n_attempts += 1
-        dive.results.clear()
-        self._expect(dive, found.n_bytes)
-        self._measure(dive, found.in_one_piece(why))
 
     def _finish(self, dive: _Dive, facts: Mapping[str, Any], *, reused: bool) -> None:
         work = dive.work

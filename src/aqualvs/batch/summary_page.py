@@ -33,12 +33,7 @@ def range_steps(ranges: ArrayLike) -> list[float | None]:
 def range_svg(steps: Sequence[float | None], low: float, high: float) -> str:
     """Return the steps as a line in SVG; without a posture there is no line.
 
-    Parameters
-    ----------
-    steps : sequence of float or None
-        From `range_steps`.
-    low, high : float
-        Ranges at the picture's lower and upper edge, in metres.
+    `steps` are from `range_steps`; `low`, `high`: ranges at the picture's edges, in metres.
     """
     if not steps or not high > low:
         return ""
@@ -72,19 +67,9 @@ _EXAMPLES = {
 
 
 def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
-    """Write `summary.html`.
+    """Write `summary.html` of a batch's folder, the dives in the order of `records`.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the batch; reports are in `dives/NAME` below it.
-    records : sequence of DiveRecord
-        In the order of the page.
-
-    Raises
-    ------
-    OutputError
-        If the page cannot be written.
+    Reports are in `dives/NAME` below the folder. Raises `OutputError` if it cannot be written.
     """
     path = folder / SUMMARY_HTML
     text = _page(folder, records)
@@ -98,17 +83,28 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
     low, high = (min(ranges), max(ranges)) if ranges else (0.0, 0.0)
     lead = "Ranges over time share one scale"
     lead += f", {low:.2f} to {high:.2f} m; a gap is a stretch without a posture." if ranges else "."
+    notes = [note for record in records for note in _notes_on(record)]
+    max_notes = 12
+    if len(notes) > max_notes:
+        more = f"and {len(notes) - max_notes} more, in the table and in the dives’ own reports"
+        notes = [*notes[:max_notes], more]
+
+    def address(record: DiveRecord, file: str) -> str:
+        """Return the address of a file of a dive; empty if it is not there."""
+        place = Path("dives") / record.name / file
+        return quote(place.as_posix()) if (folder / place).is_file() else ""
+
     content = {
         "title": folder.resolve().name,
         "subtitle": _rigs(records),
         "cards": html.cards(_cards(records)),
-        "warnings": html.notice(list(_notes(records))),
+        "warnings": html.notice(notes),
         "lead": lead,
         "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
         "records": records,
         "with_net": any(record.net for record in records),
         "clock": clock,
-        "address": lambda record, file: _address(folder, record, file),
+        "address": address,
         "range_svg": lambda steps: html.Raw(range_svg(steps, low, high)),
         "examples": _EXAMPLES,
     }
@@ -140,15 +136,6 @@ def _cards(records: Sequence[DiveRecord]) -> list[Card]:
     ]
 
 
-def _notes(records: Sequence[DiveRecord]) -> Iterator[str]:
-    """Yield the points that deserve attention, dive by dive, up to a readable number."""
-    notes = [note for record in records for note in _notes_on(record)]
-    max_notes = 12
-    yield from notes[:max_notes]
-    if len(notes) > max_notes:
-        yield f"and {len(notes) - max_notes} more, in the table and in the dives’ own reports"
-
-
 def _notes_on(record: DiveRecord) -> Iterator[str]:
     if record.state is not DiveState.FINISHED:
         yield f"{record.name}: {record.state.value}, see the table"
@@ -161,9 +148,3 @@ def _notes_on(record: DiveRecord) -> Iterator[str]:
         n, largest = record.net["n_holes"], record.net["largest_hole_mm"]
         found = "1 hole" if n == 1 else f"{n} holes, the largest"
         yield f"{record.name}: the net has {found} of {largest:.0f} mm"
-
-
-def _address(folder: Path, record: DiveRecord, file: str) -> str:
-    """Return the address of a file of a dive; empty if it is not there."""
-    place = Path("dives") / record.name / file
-    return quote(place.as_posix()) if (folder / place).is_file() else ""

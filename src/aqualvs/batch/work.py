@@ -137,9 +137,13 @@ def probe(work: DiveWork) -> DiveProbe:
         margin = REACH if dive.rig.shutter.needs_neighbours else 0
         stat = _stat_key(Path(work.request.source))
         stat |= {"frames": work.piece_frames, "margin": margin}
-        content = read_valid_manifest(work.home / _PROBE, digest(stat)) or _store_content(
-            work, stat, _content(dive, work.piece_frames, margin)
-        )
+        folder = work.home / _PROBE
+        content = read_valid_manifest(folder, digest(stat))
+        if not content:
+            content = _content(dive, work.piece_frames, margin)
+            with writing(folder):
+                folder.mkdir(parents=True, exist_ok=True)
+                write_manifest(folder, digest(stat), content, [])
         spans = [Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"]]
         found = DiveProbe(
             source_key=content["source_key"],
@@ -171,19 +175,15 @@ def _content(dive: OpenDive, piece_frames: int, margin: int) -> dict[str, Any]:
             "n_bytes": video.n_bytes,
         }
     if isinstance(pictures, ImageSource) and path.is_dir():
-        return _images(path, piece_frames, margin)
+        files = [(image.name, image.stat()) for image in images_in(path)]
+        sizes = [stat.st_size for _, stat in files]
+        return {
+            "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
+            "spans": [asdict(span) for span in image_spans(sizes, piece_frames, margin)],
+            "why_whole": "",
+            "n_bytes": sum(sizes),
+        }
     return _uncut(path, "recordings and bags are not split")
-
-
-def _images(folder: Path, piece_frames: int, margin: int) -> dict[str, Any]:
-    files = [(path.name, path.stat()) for path in images_in(folder)]
-    sizes = [stat.st_size for _, stat in files]
-    return {
-        "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
-        "spans": [asdict(span) for span in image_spans(sizes, piece_frames, margin)],
-        "why_whole": "",
-        "n_bytes": sum(sizes),
-    }
 
 
 def _uncut(path: Path, why: str) -> dict[str, Any]:
@@ -206,13 +206,3 @@ def _stat_key(path: Path) -> dict[str, Any]:
     found = [path, *(path.iterdir() if path.is_dir() else ())]
     latest = max(one.stat().st_mtime_ns for one in found)
     return {"path": str(path), "size": size_of(path), "n_files": len(found), "mtime_ns": latest}
-
-
-def _store_content(
-    work: DiveWork, stat: Mapping[str, Any], content: dict[str, Any]
-) -> dict[str, Any]:
-    folder = work.home / _PROBE
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_manifest(folder, digest(stat), content, [])
-    return content

@@ -275,7 +275,8 @@ def _page(
         held = result.cross_validation
         bare = f"a bare lens: {held.bare_rms_px:.2f} px"
         cards.append(Card("held-out views", f"{held.dome_rms_px:.2f} px", bare))
-    port_names = [name for name in rig.camera().params.port.names if name in sigmas]
+    housing = () if rig.housing is None else rig.housing.parameter_names
+    port_names = [name for name in housing if name in sigmas]
     names = [*POSE_PARAMETERS, *port_names, *rig.lens.parameter_names]
     what = "dome" if rig.flat_port is None else "flat port"
     return CalibrationPage(

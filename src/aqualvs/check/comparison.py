@@ -21,7 +21,7 @@ from aqualvs.check.finding import escaped, number_table, share_plane
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.optics.camera import POSE_PARAMETERS
+from aqualvs.optics.camera import POSE_PARAMETERS, Housing
 from aqualvs.optics.expected_error import WallView
 from aqualvs.optics.rig import (
     LASER_PARAMETERS,
@@ -119,7 +119,10 @@ def rig_difference(
     change = np.array([*changes.values()])
     same = change == 0.0
     covariance = _conditional(old_uncertainty.of(names), same)
-    basis = _basis_change(names, bases)
+    basis = np.eye(len(names))
+    for laser, own in bases.items():
+        rows = [names.index(f"{laser}:{name}") for name in LASER_PARAMETERS]
+        basis[np.ix_(rows, rows)] = own
     covariance += _conditional(basis @ new_uncertainty.of(names) @ basis.T, same)
     return RigDifference(names, change, covariance)
 
@@ -171,15 +174,6 @@ def _laser_change(new: Laser, old: Laser) -> tuple[FloatArray, FloatArray]:
     old_from_new[:2, :2] = sign * basis @ tangent_basis(new.plane.normal).T
     old_from_new[2, 2] = sign
     return np.array([*tilt, plane.offset - old.plane.offset]), old_from_new
-
-
-def _basis_change(names: tuple[str, ...], bases: dict[str, FloatArray]) -> FloatArray:
-    """Return the matrix (P, P) that applies the change of basis of each laser, by its name."""
-    matrix = np.eye(len(names))
-    for laser, basis in bases.items():
-        rows = [names.index(f"{laser}:{name}") for name in LASER_PARAMETERS]
-        matrix[np.ix_(rows, rows)] = basis
-    return matrix
 
 
 def _conditional(covariance: FloatArray, same: BoolArray) -> FloatArray:
@@ -295,8 +289,8 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
 
     Raises `RigError` if one of the files is not a rig file.
     """
-    new_rig, new_uncertainty = _loaded(new)
-    old_rig, old_uncertainty = _loaded(old)
+    new_rig, old_rig = (load_rig(path, need_lasers=False) for path in (new, old))
+    new_uncertainty, old_uncertainty = rig_uncertainty(new_rig), rig_uncertainty(old_rig)
     new_rig = _with_all_coefficients(new_rig, old_rig)
     old_rig = _with_all_coefficients(old_rig, new_rig)
     # The user or a calibration names the lasers: the same laser may have two names.
@@ -314,11 +308,8 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
             console.print(line, markup=False, highlight=False)
     console.print(_table(new_rig, old_rig, difference))
     known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
-    if old_names:
-        same = ", ".join(f"'{name}' as '{before}'" for name, before in old_names.items())
-        notes = [f"Lasers with new names are matched by their planes: {same}."]
-    else:
-        notes = []
+    same = ", ".join(f"'{name}' as '{before}'" for name, before in old_names.items())
+    notes = [f"Lasers with new names are matched by their planes: {same}."] if same else []
     for line in (*notes, *_missing_sigmas(known), *_mismatches(new_rig, old_rig)):
         console.print(line, markup=False, highlight=False)
     return 0
@@ -326,18 +317,23 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
 
 def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[ComparedPart]:
     """Return the parts that both rigs have, with their changes."""
-    parts = [_lens_part(difference), _rotation_part(difference)]
+    parts = [*_pose_parts(difference)]
     if same_lens_model(new, old):
         parts.append(_intrinsics_part(new, old, difference))
     else:
         parts.append(
             ComparedPart("the intrinsics", "cannot be compared", "", None, moved=True, matters=True)
         )
-    if new.dome is not None and old.dome is not None:
-        parts += [_shell_part(difference), _water_part(difference)]
-    if new.flat_port is not None and old.flat_port is not None:
-        parts += [_flat_part(difference), _water_part(difference)]
-    return parts + [_laser_part(new, a, b, difference) for a, b in _shared_lasers(new, old)]
+    if old.housing is not None and type(new.housing) is type(old.housing):
+        parts += _housing_parts(old.housing, difference)
+    for ours, theirs in _shared_lasers(new, old):
+        angle, shift, _ = _laser_move(new, ours, theirs, difference)
+        turned, moved = f"{math.degrees(angle):.2g} deg", f"{abs(shift) * 1e3:.2g} mm"
+        name, names = f"laser '{theirs.name}'", laser_parameter_names(theirs)[:3]
+        change = f"moved by {turned}, {moved} at {_WALL_M:g} m"
+        matters = angle > _TILT or abs(shift) > _SHIFT_M
+        parts.append(_part(difference, name, names, change, matters))
+    return parts
 
 
 def verdict(parts: list[ComparedPart]) -> str:
@@ -373,25 +369,14 @@ def consequence(new: Rig, old: Rig) -> Iterator[str]:
     )
 
 
-def _loaded(path: Path) -> tuple[Rig, RigUncertainty]:
-    rig = load_rig(path, need_lasers=False)
-    try:
-        return rig, rig_uncertainty(rig)
-    except RigError as error:
-        raise RigError(f"{path}: {error}") from None
-
-
-def _lens_part(difference: RigDifference) -> ComparedPart:
-    names = POSE_PARAMETERS[:3]
-    shift = float(np.linalg.norm([difference.of(name) for name in names]))
-    return _part(difference, "the lens", names, f"moved by {shift * 1e3:.2g} mm", shift > _LENS_M)
-
-
-def _rotation_part(difference: RigDifference) -> ComparedPart:
-    names = POSE_PARAMETERS[3:]
-    angle = float(np.linalg.norm([difference.of(name) for name in names]))
+def _pose_parts(difference: RigDifference) -> Iterator[ComparedPart]:
+    lens, turn = POSE_PARAMETERS[:3], POSE_PARAMETERS[3:]
+    shift, angle = (
+        float(np.linalg.norm([difference.of(name) for name in names])) for names in (lens, turn)
+    )
+    yield _part(difference, "the lens", lens, f"moved by {shift * 1e3:.2g} mm", shift > _LENS_M)
     change = f"turned by {math.degrees(angle):.2g} deg"
-    return _part(difference, "the camera", names, change, angle > _TURN, "did not turn")
+    yield _part(difference, "the camera", turn, change, angle > _TURN, "did not turn")
 
 
 def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> ComparedPart:
@@ -416,39 +401,22 @@ def _distortion_change_px(new: Rig, old: Rig) -> float:
     return float(np.sqrt(squared.mean())) if squared.size else math.inf
 
 
-def _shell_part(difference: RigDifference) -> ComparedPart:
-    names = ("inner_radius", "thickness", "n_acrylic")
-    radius, thickness, index = (difference.of(name) for name in names)
-    change = f"changed by {radius * 1e3:+.2g} mm in radius, {thickness * 1e3:+.2g} mm in thickness"
-    change += f" and {index:+.2g} in index"
-    matters = max(abs(radius), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
-    return _part(difference, "the dome", names, change, matters)
-
-
-def _flat_part(difference: RigDifference) -> ComparedPart:
-    names = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
-    distance, thickness, index, *tilts = (difference.of(name) for name in names)
+def _housing_parts(housing: Housing, difference: RigDifference) -> Iterator[ComparedPart]:
+    """Yield the changes of the dome or flat port, and of the water."""
+    names = tuple(housing.numbers())
+    size, thickness, index, *tilts = (difference.of(name) for name in names)
     tilt = math.hypot(*tilts)
-    change = (
-        f"changed by {distance * 1e3:+.2g} mm in distance, {thickness * 1e3:+.2g} mm in thickness"
-    )
-    change += f", {index:+.2g} in index and {math.degrees(tilt):.2g} degrees in tilt"
-    matters = max(abs(distance), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
-    return _part(difference, "the flat port", names, change, matters or tilt > _PORT_TILT)
-
-
-def _water_part(difference: RigDifference) -> ComparedPart:
+    name, what = ("the flat port", "distance") if tilts else ("the dome", "radius")
+    change = f"changed by {size * 1e3:+.2g} mm in {what}, {thickness * 1e3:+.2g} mm in thickness"
+    if tilts:
+        change += f", {index:+.2g} in index and {math.degrees(tilt):.2g} degrees in tilt"
+    else:
+        change += f" and {index:+.2g} in index"
+    matters = max(abs(size), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
+    yield _part(difference, name, names, change, matters or tilt > _PORT_TILT)
     step = difference.of("n_water")
     change = f"changed its index by {step:+.4f}"
-    return _part(difference, "the water", ("n_water",), change, abs(step) > _INDEX)
-
-
-def _laser_part(new_rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> ComparedPart:
-    names = laser_parameter_names(old)[:3]
-    angle, shift, _ = _laser_move(new_rig, new, old, difference)
-    change = f"moved by {math.degrees(angle):.2g} deg, {abs(shift) * 1e3:.2g} mm at {_WALL_M:g} m"
-    matters = angle > _TILT or abs(shift) > _SHIFT_M
-    return _part(difference, f"laser '{old.name}'", names, change, matters)
+    yield _part(difference, "the water", ("n_water",), change, abs(step) > _INDEX)
 
 
 def _part(
@@ -554,21 +522,17 @@ def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:
     values, values_before = rig_numbers(new), rig_numbers(old)
     for name in difference.names:
         if ":" not in name:
-            table.add_row(*_row(name, values[name], values_before[name], difference))
+            label = file_parameter_name(name)
+            scale = _SCALES.get(label.rpartition("_")[2], 1.0)
+            pair = [f"{scale * known[name]:.6g}" for known in (values_before, values)]
+            # Of rotations, only the change has a meaning.
+            cells = ["", ""] if name in POSE_PARAMETERS[3:] else pair
+            change, sigma = scale * difference.of(name), scale * difference.sigma(name)
+            table.add_row(label, *cells, *_change_cells(change, sigma))
     for ours, theirs in _shared_lasers(new, old):
         for row in _laser_rows(new, ours, theirs, difference):
             table.add_row(*row)
     return table
-
-
-def _row(name: str, new: float, old: float, difference: RigDifference) -> list[str]:
-    label = file_parameter_name(name)
-    scale = _SCALES.get(label.rpartition("_")[2], 1.0)
-    change, sigma = scale * difference.of(name), scale * difference.sigma(name)
-    # Of rotations, only the change has a meaning.
-    is_rotation = name in POSE_PARAMETERS[3:]
-    values = ["", ""] if is_rotation else [f"{scale * old:.6g}", f"{scale * new:.6g}"]
-    return [label, *values, *_change_cells(change, sigma)]
 
 
 def _change_cells(change: float, sigma: float) -> list[str]:
@@ -582,23 +546,20 @@ def _change_cells(change: float, sigma: float) -> list[str]:
 def _laser_rows(rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> Iterator[list[str]]:
     angle, shift, sigma = _laser_move(rig, new, old, difference)
     label = escaped(old.name)
+    # The sigma of a rotation in the direction in which the laser has turned.
+    rows = [difference.names.index(name) for name in laser_parameter_names(old)[:2]]
+    tilt = difference.change[rows]
+    length, turned_sigma = float(np.linalg.norm(tilt)), 0.0
+    if length:
+        variance = float(tilt @ difference.covariance[np.ix_(rows, rows)] @ tilt)
+        turned_sigma = math.sqrt(variance) / length
     turn = [f"{label} turned by deg", "", ""]
-    yield turn + _change_cells(math.degrees(angle), math.degrees(_tilt_sigma(old, difference)))
+    yield turn + _change_cells(math.degrees(angle), math.degrees(turned_sigma))
     if math.isfinite(shift):
         moved = [f"{label} off at {_WALL_M:g} m by mm", "", ""]
         # Points that have not moved differ by rounding.
         shift = 0.0 if abs(shift) < 1e-12 else shift
         yield moved + _change_cells(shift * 1e3, sigma * 1e3)
-
-
-def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
-    """Return the sigma of a laser's rotation in the direction in which it has turned."""
-    rows = [difference.names.index(name) for name in laser_parameter_names(laser)[:2]]
-    tilt = difference.change[rows]
-    length = float(np.linalg.norm(tilt))
-    if length == 0.0:
-        return 0.0
-    return math.sqrt(float(tilt @ difference.covariance[np.ix_(rows, rows)] @ tilt)) / length
 
 
 def _degrees(angle: float) -> str:

@@ -68,12 +68,8 @@ _MODES = {
 def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> Iterator[Finding]:
     """Wait for the heartbeat of an autopilot, listen for a while, and read its parameters.
 
-    Parameters
-    ----------
-    address : str
-        As in `parse_address`.
-    rig : Path or None
-        Rig file whose working range the autopilot's rangefinder should accept.
+    `address` is as in `parse_address`; `rig` is the file of a rig whose working range the
+    autopilot's rangefinder should accept.
     """
     working_range = None if rig is None else load_rig(rig).working_range
     with contextlib.closing(MavlinkLink(address, vehicle.link)) as link:
@@ -101,19 +97,18 @@ def _ardusub(
 ) -> Iterator[Finding]:
     """Listen to an ArduSub for a while; yield findings on modes, messages and parameters."""
     began_s = time.monotonic()
-    before = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
+    before = {kind: link.n_received(kind) for kind in _RATES}
     parameters = link.read_parameters((*FOR_STICKS, *FOR_DISTANCE), timeout_s=_LISTEN_S)
     # Counting messages, and hearing the ground station, takes some seconds.
     time.sleep(max(0.0, began_s + _LISTEN_S - time.monotonic()))
     span_s = time.monotonic() - began_s
-    after = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
-    attitude_hz, channels_hz = ((b - a) / span_s for a, b in zip(before, after, strict=True))
+    rates_hz = {kind: (link.n_received(kind) - n) / span_s for kind, n in before.items()}
     steering = vehicle.steering
     state = ArduSubLink(link, steering, advises=False).state()
     yield _mode(state, steering.own_modes)
     yield _station(link, steering)
-    yield _attitude(attitude_hz)
-    yield _channels(channels_hz)
+    for kind, rate_hz in rates_hz.items():
+        yield _rate(kind, rate_hz)
     if not parameters:
         yield Finding.warn(
             "no parameters received: the vehicle does not answer; check its settings in the "
@@ -148,28 +143,34 @@ def _station(link: MavlinkLink, steering: ArduSubOptions) -> Finding:
     )
 
 
-def _attitude(rate_hz: float) -> Finding:
+_RATES = {
     # Between heartbeats, this message shows that the vehicle is alive.
-    enough_hz = 10.0
-    text = f"ATTITUDE {rate_hz:.0f} Hz"
-    if rate_hz >= enough_hz:
-        return Finding.ok(f"{text}: follow hears the vehicle between its heartbeats")
-    return Finding.warn(
-        f"{text}: follow regards the vehicle as silent between its heartbeats; set MAV1_EXTRA1 "
-        f"{enough_hz:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)"
-    )
-
-
-def _channels(rate_hz: float) -> Finding:
+    "ATTITUDE": (
+        10.0,
+        "EXTRA1",
+        "follow hears the vehicle between its heartbeats",
+        "follow regards the vehicle as silent between its heartbeats",
+    ),
     # This message shows the positions of the pilot's sticks.
-    enough_hz = 5.0
-    text = f"RC_CHANNELS {rate_hz:.0f} Hz"
+    "RC_CHANNELS": (
+        5.0,
+        "RC_CHAN",
+        "follow sees the pilot's sticks, and whether ours are obeyed",
+        "follow sees the pilot's sticks late or not at all, and not whether ours are obeyed",
+    ),
+}
+"""By message: the rate that is enough, in hertz, the parameter of ArduSub that sets the rate, and
+what is said of enough and of too few messages."""
+
+
+def _rate(kind: str, rate_hz: float) -> Finding:
+    enough_hz, parameter, enough, too_few = _RATES[kind]
+    text = f"{kind} {rate_hz:.0f} Hz"
     if rate_hz >= enough_hz:
-        return Finding.ok(f"{text}: follow sees the pilot's sticks, and whether ours are obeyed")
+        return Finding.ok(f"{text}: {enough}")
     return Finding.warn(
-        f"{text}: follow sees the pilot's sticks late or not at all, and not whether ours are "
-        "obeyed; set MAV1_RC_CHAN 10 (before 4.7: SR0_RC_CHAN; the number is that of the "
-        "autopilot's port)"
+        f"{text}: {too_few}; set MAV1_{parameter} 10 (before 4.7: SR0_{parameter}; the number is "
+        "that of the autopilot's port)"
     )
 
 
@@ -217,19 +218,16 @@ def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
         checks.append(partial(autopilot, request.mavlink, request.vehicle, request.rig))
     bad: list[str] = []
     for check in checks:
-        found = list(_with_fault(check))
+        found: list[Finding] = []
+        try:
+            for finding in check():
+                found.append(finding)
+        except AqualvsError as fault:
+            found.append(Finding.bad(str(fault)))
         console.print(findings_table(found))
         bad += [finding.sentence for finding in found if finding.severity is Severity.BAD]
     if bad:
         raise AqualvsError(f"not ready: {bad[0]}")
-
-
-def _with_fault(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """Yield the findings of a check; an `AqualvsError` that ends it is a bad finding."""
-    try:
-        yield from check()
-    except AqualvsError as fault:
-        yield Finding.bad(str(fault))
 
 
 def _machine() -> Iterator[Finding]:

@@ -60,15 +60,7 @@ def check_solved(
 ) -> Iterator[Finding]:
     """Yield findings on the calibration of a rig.
 
-    Parameters
-    ----------
-    rig : Rig
-    steps : dict of SolvedStep
-        Calibration steps of the rig, from `solved_steps`.
-    uncertainty : RigUncertainty
-        Of the rig.
-    now : datetime
-        Current time, with a time zone.
+    `steps` are its calibrations, from `solved_steps`, and `now` is the time, with a time zone.
     """
     for name, step in steps.items():
         yield _step_summary(name, step, now)
@@ -177,46 +169,46 @@ def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
 def _undetermined(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
     """Yield warnings on parameters that the calibration did not determine."""
     lens = _largest(uncertainty, POSE_PARAMETERS[:3])
-    if lens > _LENS_M:
-        yield _warning(
+    turn = _largest(uncertainty, POSE_PARAMETERS[3:])
+    focal = _largest(uncertainty, ("fx", "fy")) / rig.focal_px
+    index = _largest(uncertainty, ("n_water",))
+    tested = [
+        (
+            lens > _LENS_M,
             f"The position of the lens in the dome is known only to {lens * 1e3:.1f} mm",
             "show the board nearer and in water, or at known distances",
-        )
-    turn = _largest(uncertainty, POSE_PARAMETERS[3:])
-    if turn > _TURN:
-        yield _warning(
+        ),
+        (
+            turn > _TURN,
             f"The camera's rotation in the dome is known only to {math.degrees(turn):.1f} degrees",
             "give the poses of the boards",
-        )
-    focal = _largest(uncertainty, ("fx", "fy")) / rig.focal_px
-    if focal > _FOCAL_SHARE:
-        yield _warning(
+        ),
+        (
+            focal > _FOCAL_SHARE,
             f"The focal length is known only to {focal:.1%}",
             "show the board tilted, and as large as the picture",
-        )
-    index = _largest(uncertainty, ("n_water",))
-    if index > _INDEX:
-        yield _warning(
-            f"The water's index is known only to {index:.1g}", "give temperature and salinity"
-        )
+        ),
+        (
+            index > _INDEX,
+            f"The water's index is known only to {index:.1g}",
+            "give temperature and salinity",
+        ),
+    ]
     for laser in rig.lasers:
         tilt_1, tilt_2, offset = laser_parameter_names(laser)[:3]
         tilt, shift = _largest(uncertainty, (tilt_1, tilt_2)), _largest(uncertainty, (offset,))
-        if tilt > _TILT or shift > _OFFSET_M:
-            yield _warning(
-                f"Laser '{laser.name}' is known only to {math.degrees(tilt):.2g} degrees and "
-                f"{shift * 1e3:.2g} mm",
-                "show its stripe on more surfaces, near and far",
-            )
+        fact = f"Laser '{laser.name}' is known only to {math.degrees(tilt):.2g} degrees and "
+        fact += f"{shift * 1e3:.2g} mm"
+        remedy = "show its stripe on more surfaces, near and far"
+        tested.append((tilt > _TILT or shift > _OFFSET_M, fact, remedy))
+    for is_large, fact, remedy in tested:
+        if is_large:
+            yield Finding.warn(f"{fact} (one sigma); {remedy}, and calibrate again.")
 
 
 def _largest(uncertainty: RigUncertainty, names: tuple[str, ...]) -> float:
     """Return the largest sigma of some parameters in any direction; 0 if none is known."""
     return math.sqrt(max(float(np.linalg.eigvalsh(uncertainty.of(names))[-1]), 0.0))
-
-
-def _warning(fact: str, remedy: str) -> Finding:
-    return Finding.warn(f"{fact} (one sigma); {remedy}, and calibrate again.")
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
@@ -229,14 +221,6 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
     ends = [[-0.5, middle_y], [width - 0.5, middle_y], [middle_x, -0.5], [middle_x, height - 0.5]]
     rays = camera.rays(ends)
     return _angle(rays, 0, 1), _angle(rays, 2, 3)
-
-
-def blind_fraction(camera: Camera) -> float:
-    """Return the fraction of pixels, on a grid, that see nothing of the outer medium."""
-    width, height = camera.size_px
-    x, y = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33))
-    rays = camera.rays(np.stack([x, y], axis=-1))
-    return float(np.mean(~rays.valid))
 
 
 def _angle(rays: Rays, first: int, second: int) -> float:
@@ -305,18 +289,16 @@ def _check_lens(rig: Rig) -> Iterator[Finding]:
         yield Finding.ok("There is no dome and no water: rays start at the lens, in air.")
     elif rig.dome is None:
         yield Finding.warn("There is no dome: rays start at the lens, in the water.")
+    elif distance >= rig.dome.inner_radius:
+        yield Finding.bad(
+            f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, outside the inner "
+            f"radius of {rig.dome.inner_radius * 1e3:g} mm; correct camera.position_mm."
+        )
     else:
-        gap = rig.dome.inner_radius - distance
-        if gap <= 0.0:
-            yield Finding.bad(
-                f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, outside the inner "
-                f"radius of {rig.dome.inner_radius * 1e3:g} mm; correct camera.position_mm."
-            )
-        else:
-            yield Finding.ok(
-                f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, "
-                f"{gap * 1e3:.1f} mm inside the dome."
-            )
+        yield Finding.ok(
+            f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, "
+            f"{(rig.dome.inner_radius - distance) * 1e3:.1f} mm inside the dome."
+        )
     width, height = rig.size_px
     across, down = (rig.lens.cx + 0.5) / width, (rig.lens.cy + 0.5) / height
     if not (0.25 < across < 0.75 and 0.25 < down < 0.75):
@@ -347,7 +329,9 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
             "measured against the dome's axes."
         )
     across, down = (math.degrees(angle) for angle in field_of_view(camera))
-    blind = blind_fraction(camera)
+    # Share of pixels, on a grid, that see nothing of the outer medium.
+    grid = np.meshgrid(*(np.linspace(0, side - 1, 33) for side in rig.size_px))
+    blind = float(np.mean(~camera.rays(np.stack(grid, axis=-1)).valid))
     if math.isnan(across) or math.isnan(down) or blind > 0.0:
         yield Finding.warn(
             f"{blind:.0%} of the picture sees no water: the lens model ends or "
@@ -362,7 +346,10 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
 def _check_water(rig: Rig) -> Finding:
     n = rig.n_water
     if 1.32 <= n <= 1.36:
-        return Finding.ok(f"The water's index {n:.4f} is that of {_water_name(n)}.")
+        # Quan & Fry at 532 nm: fresh 1.334 to 1.336, sea (35 per mille) 1.340 to 1.343.
+        fresh, sea = 1.330 <= n < 1.3375, 1.3375 <= n <= 1.345
+        name = "fresh" if fresh else "sea" if sea else "unusual, but possible,"
+        return Finding.ok(f"The water's index {n:.4f} is that of {name} water.")
     if rig.is_air(rig.n_water):
         return Finding(
             Severity.OK if rig.housing is None else Severity.WARN,
@@ -372,13 +359,6 @@ def _check_water(rig: Rig) -> Finding:
         f"The water's index {n:.4f} is not that of water, which has 1.330 to 1.345 for green "
         "light; correct water.n, or give temperature_c and salinity_permille."
     )
-
-
-def _water_name(n: float) -> str:
-    # Quan & Fry at 532 nm: fresh 1.334 to 1.336, sea (35 per mille) 1.340 to 1.343.
-    if 1.330 <= n < 1.3375:
-        return "fresh water"
-    return "sea water" if 1.3375 <= n <= 1.345 else "unusual, but possible, water"
 
 
 def _check_index(rig: Rig) -> Finding:
@@ -419,12 +399,17 @@ def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     near, far = rig.working_range
     # Least distance of the plane from the lens, in metres: nearer, one pixel is hundreds of
     # millimetres of range at 0.6 m.
-    least_baseline = 1e-3
+    least_baseline, small_baseline = 1e-3, 10e-3
     baseline = abs(float(laser.plane.normal @ rig.dome_from_cam.translation) - laser.plane.offset)
     if baseline < least_baseline:
         return Finding.bad(
             f"Laser '{laser.name}' passes the lens at {baseline * 1e3:.2g} mm, so that its stripe "
             "does not move with range; offset_mm is in millimetres."
+        )
+    if baseline < small_baseline:
+        return Finding.warn(
+            f"Laser '{laser.name}' passes the lens at {baseline * 1e3:.2g} mm, so that its stripe "
+            "hardly moves with range; turn its line across the way from the lens to the laser."
         )
     n_ranges = 43
     walls = np.geomspace(near, far, n_ranges)

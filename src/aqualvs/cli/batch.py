@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from aqualvs.cli.command import (
     MAX_WORKERS,
@@ -24,27 +25,27 @@ def batch(
     context: typer.Context,
     dives: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="DIVES",
             help="Videos, recordings, folders, patterns such as 'dives/**/*.mp4', or a list (CSV "
             "or YAML) with columns dive, rig, name, water_n, temperature_c, salinity, log, "
             "log_offset_s.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write or to resume.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write or to resume.")],
     rig: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Rig file for all dives; by default NAME.rig.yaml or rig.yaml beside each dive."
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(max=MAX_WORKERS, help="Processes on this machine; one per core by default."),
+        Option(max=MAX_WORKERS, help="Processes on this machine; one per core by default."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="URL",
             help="Dask scheduler whose workers to use, such as tcp://192.168.1.10:8786.",
         ),
@@ -58,29 +59,29 @@ def batch(
     salinity: Salinity = None,
     dome: Refraction = True,
     fps: Annotated[
-        float | None, typer.Option(help="Frame rate of folders of images; 1 by default.")
+        float | None, Option(help="Frame rate of folders of images; 1 by default.")
     ] = None,
     index_target: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Target on the vehicle (target.yaml) from which to track the water's index; dives "
             "are then not split."
         ),
     ] = None,
-    report: Annotated[bool, typer.Option(help="Write report.html for each dive.")] = True,
+    report: Annotated[bool, Option(help="Write report.html for each dive.")] = True,
     net: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--net",
             help="Also report the condition of each dive's net, as aqualvs net does; a list may "
             "name the vehicles' logs.",
         ),
     ] = False,
     twine_mm: Annotated[
-        float | None, typer.Option(help="With --net: diameter of the bare twine, if known.")
+        float | None, Option(help="With --net: diameter of the bare twine, if known.")
     ] = None,
     stretch_m: Annotated[
-        float | None, typer.Option(help="With --net: length of a stretch of net, 0.5 by default.")
+        float | None, Option(help="With --net: length of a stretch of net, 0.5 by default.")
     ] = None,
 ) -> None:
     """Measure many dives."""
@@ -91,15 +92,13 @@ def batch(
     with importing():
         from aqualvs.batch import command as body
         from aqualvs.nets.target_file import net_request
-        from aqualvs.results.run_request import Water, scanner_options
+        from aqualvs.results.run_request import RunRequest, Water, scanner_options
 
-    request = body.BatchRequest(
-        dives=tuple(dives),
-        out=out,
+    run = RunRequest(
+        source="",
         rig=rig,
+        out=out,
         water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
-        scheduler=scheduler,
-        n_workers=workers,
         no_dome=not dome,
         fps=fps,
         scanner=scanner_options(target, detector, mesh_filter, fit),
@@ -109,4 +108,5 @@ def batch(
         report=report,
         net=net_request(wanted=net, twine_mm=twine_mm, stretch_m=stretch_m),
     )
+    request = body.BatchRequest(dives=tuple(dives), run=run, scheduler=scheduler, n_workers=workers)
     raise typer.Exit(body.batch(request, typer.echo))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from aqualvs.cli.command import (
     Celsius,
@@ -45,19 +46,17 @@ def _steps(context: typer.Context) -> None:
 
 
 Pictures = Annotated[
-    list[str], typer.Argument(help="Pictures, folders of them, or patterns such as 'air/*.png'.")
+    list[str], Argument(help="Pictures, folders of them, or patterns such as 'air/*.png'.")
 ]
-BoardFile = Annotated[Path, typer.Option("--board", help="Board in the pictures (board.yaml).")]
-RigIn = Annotated[Path, typer.Option("--rig", help="Rig file of the previous step.")]
+BoardFile = Annotated[Path, Option("--board", help="Board in the pictures (board.yaml).")]
+RigIn = Annotated[Path, Option("--rig", help="Rig file of the previous step.")]
 RigOut = Annotated[
     Path,
-    typer.Option(
-        "--out", "-o", help="Rig file to write; an existing one is kept under a dated name."
-    ),
+    Option("--out", "-o", help="Rig file to write; an existing one is kept under a dated name."),
 ]
 Medium = Annotated[
     str | None,
-    typer.Option(
+    Option(
         metavar="air|water|N",
         help="Medium outside the dome: air, the rig's water, or an index.",
         show_default=False,
@@ -76,18 +75,14 @@ def camera(
     out: RigOut,
     nominal: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Nominal values: a rig file, or a file with name, dome, lasers, working range."
         ),
     ] = None,
-    model: Annotated[
-        Literal["opencv", "fisheye"], typer.Option(help="Distortion model.")
-    ] = "opencv",
+    model: Annotated[Literal["opencv", "fisheye"], Option(help="Distortion model.")] = "opencv",
     coefficients: Annotated[
         Literal["auto", "0", "4", "5", "8"],
-        typer.Option(
-            help="Number of distortion coefficients; auto takes as many as the data support."
-        ),
+        Option(help="Number of distortion coefficients; auto takes as many as the data support."),
     ] = "auto",
 ) -> None:
     """Calibrate the camera."""
@@ -120,52 +115,47 @@ def dome(
     rig: RigIn,
     out: RigOut,
     poses: Annotated[
-        Path | None,
-        typer.Option(help="Known poses of the boards (poses.csv): distances, or full poses."),
+        Path | None, Option(help="Known poses of the boards (poses.csv): distances, or full poses.")
     ] = None,
     medium: Medium = "air",
     water_images: Annotated[
-        list[str] | None, typer.Option(help="Additional pictures, taken in water; repeatable.")
+        list[str] | None, Option(help="Additional pictures, taken in water; repeatable.")
     ] = None,
     water_board: Annotated[
-        Path | None, typer.Option(help="Board in --water-images, if it is a different one.")
+        Path | None, Option(help="Board in --water-images, if it is a different one.")
     ] = None,
     water_poses: Annotated[
-        Path | None, typer.Option(help="Poses of the boards in --water-images.")
+        Path | None, Option(help="Poses of the boards in --water-images.")
     ] = None,
-    inner_radius_mm: Annotated[float | None, typer.Option(help="Inner radius of the dome.")] = None,
-    thickness_mm: Annotated[float | None, typer.Option(help="Thickness of the housing.")] = None,
-    n_acrylic: Annotated[
-        float | None, typer.Option(help="Refractive index of the housing.")
-    ] = None,
+    inner_radius_mm: Annotated[float | None, Option(help="Inner radius of the dome.")] = None,
+    thickness_mm: Annotated[float | None, Option(help="Thickness of the housing.")] = None,
+    n_acrylic: Annotated[float | None, Option(help="Refractive index of the housing.")] = None,
     port_distance_mm: Annotated[
         float | None,
-        typer.Option(
-            help="Initial guess of a flat port's distance from the lens, instead of a dome."
-        ),
+        Option(help="Initial guess of a flat port's distance from the lens, instead of a dome."),
     ] = None,
     radius_tolerance_mm: Annotated[
-        float, typer.Option(help="Uncertainty of the radius (one sigma).")
+        float, Option(help="Uncertainty of the radius (one sigma).")
     ] = 0.1,
     thickness_tolerance_mm: Annotated[
-        float, typer.Option(help="Uncertainty of the thickness (one sigma).")
+        float, Option(help="Uncertainty of the thickness (one sigma).")
     ] = 0.1,
     acrylic_tolerance: Annotated[
-        float, typer.Option(help="Uncertainty of the housing's index (one sigma).")
+        float, Option(help="Uncertainty of the housing's index (one sigma).")
     ] = 0.003,
     distance_sigma_mm: Annotated[
-        float, typer.Option(help="Uncertainty of the poses' distances (one sigma).")
+        float, Option(help="Uncertainty of the poses' distances (one sigma).")
     ] = 0.2,
     shared_tilt_sigma_deg: Annotated[
         float,
-        typer.Option(
+        Option(
             help="Uncertainty (one sigma, about each axis) of a tilt that all boards at known "
             "distances share, as on a carriage that is not square to its rail."
         ),
     ] = 0.0,
     refine_intrinsics: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--refine-intrinsics/--keep-intrinsics",
             help="Refine the intrinsics within the uncertainty of the camera's calibration.",
         ),
@@ -210,29 +200,26 @@ def lasers(
     images: Pictures,
     rig: RigIn,
     out: RigOut,
-    box: Annotated[Path | None, typer.Option(help="Box of markers (box.yaml).")] = None,
-    board: Annotated[Path | None, typer.Option(help="Board on the plane of the stripes.")] = None,
+    box: Annotated[Path | None, Option(help="Box of markers (box.yaml).")] = None,
+    board: Annotated[Path | None, Option(help="Board on the plane of the stripes.")] = None,
     medium: Medium = None,
-    n_lasers: Annotated[
-        int | None, typer.Option("--lasers", help="Number of lasers, if known.")
-    ] = None,
+    n_lasers: Annotated[int | None, Option("--lasers", help="Number of lasers, if known.")] = None,
     names: Annotated[
         str | None,
-        typer.Option(metavar="A,B,C", help="Names of the lasers, left to right in the picture."),
+        Option(metavar="A,B,C", help="Names of the lasers, left to right in the picture."),
     ] = None,
     wavelength_nm: Annotated[
         float | None,
-        typer.Option(
+        Option(
             help="Wavelength of the lasers, for example 650 for red; by default that of the rig's "
             "lasers, else green."
         ),
     ] = None,
     board_offset_mm: Annotated[
-        float, typer.Option(help="Distance of the board in front of the plane of the stripes.")
+        float, Option(help="Distance of the board in front of the plane of the stripes.")
     ] = 0.0,
     refine: Annotated[
-        bool,
-        typer.Option("--refine", help="Refine camera, dome and water together with the planes."),
+        bool, Option("--refine", help="Refine camera, dome and water together with the planes.")
     ] = False,
 ) -> None:
     """Calibrate the lasers."""
@@ -264,18 +251,18 @@ def lasers(
     "-o rig.yaml",
 )
 def water(
-    source: Annotated[list[str], typer.Argument(help="Video, pictures, or a folder of them.")],
-    target: Annotated[Path, typer.Option(help="Target on the vehicle (target.yaml).")],
+    source: Annotated[list[str], Argument(help="Video, pictures, or a folder of them.")],
+    target: Annotated[Path, Option(help="Target on the vehicle (target.yaml).")],
     rig: RigIn,
     out: RigOut,
     temperature_c: Celsius = None,
     salinity: Salinity = None,
-    fps: Annotated[float | None, typer.Option(help="Frame rate of pictures.")] = None,
+    fps: Annotated[float | None, Option(help="Frame rate of pictures.")] = None,
     place_sigma_mm: Annotated[
-        float, typer.Option(help="Uncertainty of the target's position (one sigma).")
+        float, Option(help="Uncertainty of the target's position (one sigma).")
     ] = 0.2,
     turn_sigma_deg: Annotated[
-        float, typer.Option(help="Uncertainty of the target's rotation (one sigma).")
+        float, Option(help="Uncertainty of the target's rotation (one sigma).")
     ] = 0.1,
 ) -> None:
     """Calibrate the water."""
@@ -304,10 +291,10 @@ def water(
     epilog="Example: aqualvs calibrate shutter dive.mp4 --rig rig.yaml -o rig.yaml",
 )
 def shutter(
-    source: Annotated[str, typer.Argument(help="Video, or a folder of pictures.")],
+    source: Annotated[str, Argument(help="Video, or a folder of pictures.")],
     rig: RigIn,
     out: RigOut,
-    fps: Annotated[float | None, typer.Option(help="Frame rate of pictures.")] = None,
+    fps: Annotated[float | None, Option(help="Frame rate of pictures.")] = None,
 ) -> None:
     """Calibrate the shutter."""
     from aqualvs.calibrate import shutter as body
@@ -319,42 +306,40 @@ def board(
     context: typer.Context,
     kind: Annotated[
         Literal["charuco", "chessboard", "box", "plate"],
-        typer.Argument(
+        Argument(
             help="A board for camera and dome, the markers of a box for the lasers, or a plate "
             "of markers, fixed to the vehicle, for the water."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="OUT.pdf and OUT.yaml are written.")],
+    out: Annotated[Path, Option("--out", "-o", help="OUT.pdf and OUT.yaml are written.")],
     paper: Annotated[
-        str, typer.Option(metavar="a4..a0|letter|WxH|fit", help="Paper; WxH in millimetres.")
+        str, Option(metavar="a4..a0|letter|WxH|fit", help="Paper; WxH in millimetres.")
     ] = "a4",
     squares_x: Annotated[
-        int | None, typer.Option(help="Number of squares, or markers of a plate, across.")
+        int | None, Option(help="Number of squares, or markers of a plate, across.")
     ] = None,
     squares_y: Annotated[
-        int | None, typer.Option(help="Number of squares, or markers of a plate, down.")
+        int | None, Option(help="Number of squares, or markers of a plate, down.")
     ] = None,
     square_mm: Annotated[
-        float | None, typer.Option(help="Side of a square; by default as large as fits.")
+        float | None, Option(help="Side of a square; by default as large as fits.")
     ] = None,
-    marker_mm: Annotated[float | None, typer.Option(help="Side of a marker.")] = None,
+    marker_mm: Annotated[float | None, Option(help="Side of a marker.")] = None,
     dictionary: Annotated[
-        str | None, typer.Option(help="OpenCV's name of the marker dictionary.")
+        str | None, Option(help="OpenCV's name of the marker dictionary.")
     ] = None,
-    border_mm: Annotated[float | None, typer.Option(help="Light border of a board.")] = None,
-    width_mm: Annotated[float, typer.Option(help="Width of the box, inside.")] = 400.0,
-    height_mm: Annotated[float, typer.Option(help="Height of the box, inside.")] = 380.0,
-    depth_mm: Annotated[float, typer.Option(help="Depth of the box, inside.")] = 700.0,
-    first_id: Annotated[int, typer.Option(min=0, help="Number of the first marker.")] = 0,
+    border_mm: Annotated[float | None, Option(help="Light border of a board.")] = None,
+    width_mm: Annotated[float, Option(help="Width of the box, inside.")] = 400.0,
+    height_mm: Annotated[float, Option(help="Height of the box, inside.")] = 380.0,
+    depth_mm: Annotated[float, Option(help="Depth of the box, inside.")] = 700.0,
+    first_id: Annotated[int, Option(min=0, help="Number of the first marker.")] = 0,
     position_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z", help="Position of the plate's first corner in the dome's frame."
-        ),
+        Option(metavar="X Y Z", help="Position of the plate's first corner in the dome's frame."),
     ] = None,
     rotation_deg: Annotated[
         tuple[float, float, float],
-        typer.Option(metavar="X Y Z", help="Rotation vector of the plate in the dome's frame."),
+        Option(metavar="X Y Z", help="Rotation vector of the plate in the dome's frame."),
     ] = (0.0, 0.0, 0.0),
     overwrite: Overwrite = False,
 ) -> None:
@@ -388,14 +373,14 @@ def board(
 def import_file(
     file: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             help="camera_info.yaml of ROS, FileStorage of OpenCV (YAML, XML, JSON), camchain or "
             "target of Kalibr, .cameramodel of mrcal, cameras.txt of COLMAP or Refractive COLMAP."
         ),
     ],
     out: Annotated[
         Path,
-        typer.Option(
+        Option(
             "--out",
             "-o",
             help="Rig file to write, or board.yaml; an existing rig file is kept under a dated "
@@ -404,21 +389,21 @@ def import_file(
     ],
     what: Annotated[
         Literal["camera", "rig", "board"] | None,
-        typer.Option(
+        Option(
             "--as",
             help="camera: the intrinsics only; rig: also the dome, if the file has one; board: a "
             "Kalibr target. By default everything in the file.",
         ),
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Which camera, if there are several.")
+        str | None, Option(metavar="NAME", help="Which camera, if there are several.")
     ] = None,
     model: Annotated[
         Literal["opencv", "fisheye"] | None,
-        typer.Option(help="Distortion model, if an OpenCV FileStorage does not state it."),
+        Option(help="Distortion model, if an OpenCV FileStorage does not state it."),
     ] = None,
     image: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the pictures, if the file lacks it.")
+        str | None, Option(metavar="WxH", help="Size of the pictures, if the file lacks it.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -440,14 +425,14 @@ def import_file(
 
 
 def export(
-    rig: Annotated[Path, typer.Argument(help="Rig file.")],
+    rig: Annotated[Path, Argument(help="Rig file.")],
     to: Annotated[
         Literal["ros", "opencv", "kalibr", "mrcal", "colmap", "colmap-underwater"],
-        typer.Option(help="Format; colmap-underwater is Refractive COLMAP, with the dome."),
+        Option(help="Format; colmap-underwater is Refractive COLMAP, with the dome."),
     ],
     out: Annotated[
         Path,
-        typer.Option(
+        Option(
             "--out", "-o", help="File to write; .xml and .json choose the form of a FileStorage."
         ),
     ],

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
 from aqualvs.errors import OptionError
@@ -44,42 +45,39 @@ MAX_WORKERS = 1024
 """Most processes on one machine; a larger number is a typing error that would fill its memory."""
 
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace files that this command wrote there before.")
+    bool, Option("--overwrite", help="Replace files that this command wrote there before.")
 ]
 Target = Annotated[
-    str, typer.Option(metavar="auto|net|solid|FILE", help="Kind of target: a word, or a net.yaml.")
+    str, Option(metavar="auto|net|solid|FILE", help="Kind of target: a word, or a net.yaml.")
 ]
 Detector = Annotated[
     Literal["ridge", "threshold"],
-    typer.Option(help="Stripe detector; threshold is the paper's, for comparison."),
+    Option(help="Stripe detector; threshold is the paper's, for comparison."),
 ]
 MeshFilter = Annotated[
-    Literal["none", "paper"],
-    typer.Option(help="Filter for nets; paper is the paper's Algorithm 1."),
+    Literal["none", "paper"], Option(help="Filter for nets; paper is the paper's Algorithm 1.")
 ]
 Fit = Annotated[
     Literal["robust", "pseudo_inverse"],
-    typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
+    Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
 ]
-WaterIndex = Annotated[float | None, typer.Option(help="Refractive index of the water.")]
-Celsius = Annotated[float | None, typer.Option(help="Water temperature, to compute its index.")]
+WaterIndex = Annotated[float | None, Option(help="Refractive index of the water.")]
+Celsius = Annotated[float | None, Option(help="Water temperature, to compute its index.")]
 
 Salinity = Annotated[
-    float | None, typer.Option(help="Salinity in per mille, to compute the water's index.")
+    float | None, Option(help="Salinity in per mille, to compute the water's index.")
 ]
 Refraction = Annotated[
     bool,
-    typer.Option(
-        "--dome/--no-dome", help="Model the refraction at the dome or flat port, or ignore it."
-    ),
+    Option("--dome/--no-dome", help="Model the refraction at the dome or flat port, or ignore it."),
 ]
 IndexTarget = Annotated[
     Path | None,
-    typer.Option(help="Target on the vehicle (target.yaml) from which to track the water's index."),
+    Option(help="Target on the vehicle (target.yaml) from which to track the water's index."),
 ]
 VehicleFileOption = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--vehicle-file",
         metavar="FILE",
         help="MAVLink: system ids, ground station, modes, peers, key (YAML; docs/ardusub.md).",
@@ -87,7 +85,7 @@ VehicleFileOption = Annotated[
 ]
 MavlinkPeer = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         metavar="ADDRESS",
         help="MAVLink, listening: accept only this peer, such as 192.168.2.2 or 192.168.2.0/24; "
         "repeatable.",
@@ -95,7 +93,7 @@ MavlinkPeer = Annotated[
 ]
 MavlinkKey = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         metavar="FILE",
         help="MAVLink: sign, and accept only this key; a passphrase or 64 hex digits.",
     ),
@@ -146,24 +144,20 @@ class CheckedCommand(TyperCommand):
         Raises `OptionError` with the option.
         """
         try:
-            self._refuse_empty(ctx, args)
+            if any(word == "" or word.endswith("=") for word in args):
+                found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
+                for parameter in self.params:
+                    if any(value == "" for value in _flattened(found.get(parameter.name))):
+                        raise OptionError(
+                            f"{_name(parameter)} '': is empty; give a value, or set the variable "
+                            "of the shell that should hold it"
+                        )
             return super().parse_args(ctx, args)
         except USAGE_ERROR as fault:
             # The parser leaves out the command if the value of an option is missing.
             if getattr(fault, "ctx", None) is None:
                 vars(fault)["ctx"] = ctx
             raise
-
-    def _refuse_empty(self, ctx: Any, args: Sequence[str]) -> None:
-        """Raise `OptionError` for an empty argument or value of an option."""
-        if any(word == "" or word.endswith("=") for word in args):
-            found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
-            for parameter in self.params:
-                if any(value == "" for value in _flattened(found.get(parameter.name))):
-                    raise OptionError(
-                        f"{_name(parameter)} '': is empty; give a value, or set the variable of "
-                        "the shell that should hold it"
-                    )
 
     def invoke(self, ctx: Any) -> Any:
         """Check the values and run the command.
@@ -266,16 +260,11 @@ def _check(value: Any, name: str) -> None:
         raise OptionError(f"{name} {value:g}: give a finite number")
     if isinstance(value, int) and abs(value) > max_integer:
         raise OptionError(f"{name} {value}: too large; give a number up to {max_integer}")
-    if isinstance(value, str | Path) and not _is_text(str(value)):
-        raise OptionError(f"{name} {str(value)!r}: not UTF-8; rename it")
+    if isinstance(value, str | Path):
+        try:
+            # Python decodes other bytes as surrogates.
+            str(value).encode()
+        except UnicodeEncodeError:
+            raise OptionError(f"{name} {str(value)!r}: not UTF-8; rename it") from None
     if isinstance(value, Path):
         refuse_special(value, OptionError)
-
-
-def _is_text(value: str) -> bool:
-    """Return whether a text can be encoded as UTF-8; Python decodes other bytes as surrogates."""
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True

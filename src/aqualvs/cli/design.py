@@ -5,59 +5,53 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from aqualvs.cli.command import Overwrite
 
 
 def design(
-    file: Annotated[
-        Path | None, typer.Argument(metavar="[DESIGN]", help="Design file (YAML).")
-    ] = None,
+    file: Annotated[Path | None, Argument(metavar="[DESIGN]", help="Design file (YAML).")] = None,
     example: Annotated[
-        bool, typer.Option("--example", help="Print an example design file and exit.")
+        bool, Option("--example", help="Print an example design file and exit.")
     ] = False,
     rig: Annotated[
-        Path | None, typer.Option(help="Rig file of an existing rig, instead of a design.")
+        Path | None, Option(help="Rig file of an existing rig, instead of a design.")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder to write: rig.yaml, design.html and pictures."),
+        Option("--out", "-o", help="Folder to write: rig.yaml, design.html and pictures."),
     ] = None,
     image: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the picture.")
+        str | None, Option(metavar="WIDTHxHEIGHT", help="Size of the picture.")
     ] = None,
-    fov_deg: Annotated[float | None, typer.Option(help="Horizontal field of view in air.")] = None,
+    fov_deg: Annotated[float | None, Option(help="Horizontal field of view in air.")] = None,
     dome_mm: Annotated[
-        str | None,
-        typer.Option(metavar="RADIUS:THICKNESS", help="Dome: inner radius and thickness."),
+        str | None, Option(metavar="RADIUS:THICKNESS", help="Dome: inner radius and thickness.")
     ] = None,
     flat_mm: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="DISTANCE:THICKNESS",
             help="Flat port instead of a dome: distance from the lens, and thickness.",
         ),
     ] = None,
     lens_mm: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="X,Y,Z",
             help="Position of the lens relative to the dome's centre: right, forward, up.",
         ),
     ] = None,
     baseline_mm: Annotated[
-        float | None, typer.Option(help="Distance of the lasers from the dome's centre.")
+        float | None, Option(help="Distance of the lasers from the dome's centre.")
     ] = None,
-    lasers: Annotated[int | None, typer.Option(help="Number of lasers.")] = None,
-    fan_deg: Annotated[float | None, typer.Option(help="Fan angle of a laser.")] = None,
-    range_mm: Annotated[str | None, typer.Option(metavar="NEAR:FAR", help="Working range.")] = None,
-    turn: Annotated[
-        bool, typer.Option("--turn", help="Also optimise the stripes' directions.")
-    ] = False,
-    tilt: Annotated[
-        bool, typer.Option("--tilt/--no-tilt", help="Optimise the lasers' angles.")
-    ] = True,
-    changes: Annotated[bool, typer.Option(help="Report which changes would help most.")] = True,
+    lasers: Annotated[int | None, Option(help="Number of lasers.")] = None,
+    fan_deg: Annotated[float | None, Option(help="Fan angle of a laser.")] = None,
+    range_mm: Annotated[str | None, Option(metavar="NEAR:FAR", help="Working range.")] = None,
+    turn: Annotated[bool, Option("--turn", help="Also optimise the stripes' directions.")] = False,
+    tilt: Annotated[bool, Option("--tilt/--no-tilt", help="Optimise the lasers' angles.")] = True,
+    changes: Annotated[bool, Option(help="Report which changes would help most.")] = True,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict what a design measures."""
@@ -74,13 +68,13 @@ def design(
         },
         "dome": _numbers(dome_mm, ":", ("inner_radius_mm", "thickness_mm"), "--dome-mm"),
         "flat": _numbers(flat_mm, ":", ("distance_mm", "thickness_mm"), "--flat-mm"),
-        "lens": _listed(lens_mm, ",", "position_mm", 3, "--lens-mm"),
+        "lens": {"position_mm": _split(lens_mm, ",", 3, "--lens-mm") or None},
         "lasers": {
             "count": lasers,
             "baseline_mm": baseline_mm,
             "fan_deg": None if rig else fan_deg,
         },
-        **_listed(range_mm, ":", "working_range_mm", 2, "--range-mm"),
+        "working_range_mm": _split(range_mm, ":", 2, "--range-mm"),
     }
     request = command.DesignRequest(
         design=file,
@@ -111,12 +105,6 @@ def _numbers(text: str | None, between: str, names: tuple[str, ...], option: str
     """Return the numbers of an option such as 1920x1080 by their names; empty if not given."""
     found = _split(text, between, len(names), option)
     return dict(zip(names, found, strict=False))
-
-
-def _listed(text: str | None, between: str, name: str, count: int, option: str) -> dict[str, Any]:
-    """Return the numbers of an option such as 300:1200 as one named list; empty if not given."""
-    found = _split(text, between, count, option)
-    return {name: found} if found else {}
 
 
 def _split(text: str | None, between: str, count: int, option: str) -> list[float | int]:

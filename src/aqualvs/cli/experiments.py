@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from aqualvs.cli.command import Overwrite
 
@@ -11,22 +12,22 @@ from aqualvs.cli.command import Overwrite
 def benchmark(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[LEVEL|DIVE]...", help="Levels or dives; all by default."),
+        Argument(metavar="[LEVEL|DIVE]...", help="Levels or dives; all by default."),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder to write.")] = None,
     frames: Annotated[
-        int | None, typer.Option(help="Number of frames per dive, for a quick look.")
+        int | None, Option(help="Number of frames per dive, for a quick look.")
     ] = None,
     shutter: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="KIND[:MS]",
             help="rolling:READOUT:EXPOSURE, interlaced:EXPOSURE or global:EXPOSURE; global by "
             "default.",
         ),
     ] = None,
     overwrite: Overwrite = False,
-    list_: Annotated[bool, typer.Option("--list", help="List levels and dives and exit.")] = False,
+    list_: Annotated[bool, Option("--list", help="List levels and dives and exit.")] = False,
 ) -> None:
     """Render the benchmark set."""
     from aqualvs.errors import OptionError
@@ -43,10 +44,10 @@ def benchmark(
 
 
 def score(
-    truth: Annotated[Path, typer.Option(help="Folder of the set, from 'aqualvs benchmark'.")],
+    truth: Annotated[Path, Option(help="Folder of the set, from 'aqualvs benchmark'.")],
     results: Annotated[
         list[str] | None,
-        typer.Argument(
+        Argument(
             metavar="[NAME=PATH]...",
             help="Results of a system: a folder with DIVE.csv or DIVE/posture.csv, or one CSV "
             "with a column dive.",
@@ -54,14 +55,14 @@ def score(
     ] = None,
     own: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Also run aqualvs and its baselines on the set into this folder, and score them."
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for scores.csv, .json and .md.")
+        Path | None, Option("--out", "-o", help="Folder for scores.csv, .json and .md.")
     ] = None,
-    dives: Annotated[bool, typer.Option("--dives", help="Show every dive in the table.")] = False,
+    dives: Annotated[bool, Option("--dives", help="Show every dive in the table.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Score systems."""
@@ -74,13 +75,10 @@ def score(
 
 def reproduce(
     experiments: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="EXPERIMENT", help="Names from --list; all by default."),
+        list[str] | None, Argument(metavar="EXPERIMENT", help="Names from --list; all by default.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
-        "out/reproduce"
-    ),
-    list_: Annotated[bool, typer.Option("--list", help="List the experiments and exit.")] = False,
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write.")] = Path("out/reproduce"),
+    list_: Annotated[bool, Option("--list", help="List the experiments and exit.")] = False,
 ) -> None:
     """Run the paper's experiments."""
     from aqualvs.experiments import command as body

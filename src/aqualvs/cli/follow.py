@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from aqualvs.cli.command import (
     MavlinkKey,
@@ -29,27 +30,21 @@ OF_A_SIMULATION = (
 
 
 def tune(
-    model: Annotated[
-        str, typer.Argument(help="Vehicle model: bluerov2_heavy, bluerov2 or videoray.")
-    ],
+    model: Annotated[str, Argument(help="Vehicle model: bluerov2_heavy, bluerov2 or videoray.")],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--output", help="Gains file to write; by default the gains are printed."
-        ),
+        Option("-o", "--output", help="Gains file to write; by default the gains are printed."),
     ] = None,
     overwrite: Overwrite = False,
     delay_ms: Annotated[
         float,
-        typer.Option(
-            help="Usual delay from exposure to vehicle; a shorter delay allows higher gains."
-        ),
+        Option(help="Usual delay from exposure to vehicle; a shorter delay allows higher gains."),
     ] = 120.0,
     greatest_delay_ms: Annotated[
-        float, typer.Option(help="Maximum delay at which the loop must still be stable.")
+        float, Option(help="Maximum delay at which the loop must still be stable.")
     ] = 200.0,
-    rate_hz: Annotated[float, typer.Option(help="Frames per second.")] = 25.0,
-    current: Annotated[float, typer.Option(help="Maximum current in m/s.")] = 0.5,
+    rate_hz: Annotated[float, Option(help="Frames per second.")] = 25.0,
+    current: Annotated[float, Option(help="Maximum current in m/s.")] = 0.5,
 ) -> None:
     """Compute gains for a vehicle."""
     from aqualvs.control.tune import TuneOptions
@@ -72,98 +67,85 @@ def tune(
 
 def follow(
     context: typer.Context,
-    source: Annotated[
-        str | None, typer.Argument(help="Stream or camera of a real vehicle.")
-    ] = None,
-    sim: Annotated[bool, typer.Option("--sim", help="Simulate vehicle, sea and net.")] = False,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("follow"),
-    plan: Annotated[Path | None, typer.Option(help="Plan file (YAML; docs/missions.md).")] = None,
+    source: Annotated[str | None, Argument(help="Stream or camera of a real vehicle.")] = None,
+    sim: Annotated[bool, Option("--sim", help="Simulate vehicle, sea and net.")] = False,
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write.")] = Path("follow"),
+    plan: Annotated[Path | None, Option(help="Plan file (YAML; docs/missions.md).")] = None,
     hold_range: Annotated[
-        float | None, typer.Option("--range", help="Range to hold in metres; 0.6 by default.")
+        float | None, Option("--range", help="Range to hold in metres; 0.6 by default.")
     ] = None,
-    yaw: Annotated[float, typer.Option(help="Yaw to hold, in degrees; 0 is square.")] = 0.0,
+    yaw: Annotated[float, Option(help="Yaw to hold, in degrees; 0 is square.")] = 0.0,
     gains: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="FILE|NAME",
             help="Gains: a file from 'aqualvs tune', or bluerov2, bluerov2_heavy, videoray.",
         ),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(help="Vehicle: rig file (YAML).")] = None,
+    rig: Annotated[Path | None, Option(help="Vehicle: rig file (YAML).")] = None,
     mavlink: Annotated[
-        str | None, typer.Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.")
+        str | None, Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.")
     ] = None,
     vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,
     mavlink_key: MavlinkKey = None,
     dashboard: Annotated[
-        bool,
-        typer.Option("--dashboard", help="Serve the pilot's page; --sim then runs in real time."),
+        bool, Option("--dashboard", help="Serve the pilot's page; --sim then runs in real time.")
     ] = False,
     dashboard_address: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Address of the pilot's page.")
+        str, Option(metavar="HOST:PORT", help="Address of the pilot's page.")
     ] = "127.0.0.1:8100",
     token: Annotated[
-        str | None, typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.")
+        str | None, Option(envvar="AQUALVS_TOKEN", help="Password of the page.")
     ] = None,
-    record: Annotated[
-        bool, typer.Option("--record", help="Vehicle: record from the start.")
-    ] = False,
+    record: Annotated[bool, Option("--record", help="Vehicle: record from the start.")] = False,
     record_to: Annotated[
-        Path | None, typer.Option(help="Vehicle: folder of recordings; by default that of -o.")
+        Path | None, Option(help="Vehicle: folder of recordings; by default that of -o.")
     ] = None,
     record_video: Annotated[
-        bool, typer.Option("--record-video", help="Vehicle: also record the pictures.")
+        bool, Option("--record-video", help="Vehicle: also record the pictures.")
     ] = False,
     target: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="auto|net|solid|FILE", help="Vehicle: kind of target: a word, or a net.yaml."
         ),
     ] = "auto",
-    water_n: Annotated[
-        float | None, typer.Option(help="Vehicle: refractive index of the water.")
-    ] = None,
+    water_n: Annotated[float | None, Option(help="Vehicle: refractive index of the water.")] = None,
     vehicle: Annotated[
         Literal["bluerov2", "bluerov2_heavy", "bluerov2-heavy", "videoray"],
-        typer.Option(metavar="bluerov2|bluerov2_heavy|videoray", help="Sim: vehicle model."),
+        Option(metavar="bluerov2|bluerov2_heavy|videoray", help="Sim: vehicle model."),
     ] = "bluerov2",
-    seconds: Annotated[float, typer.Option(help="Sim: duration in seconds.")] = 60.0,
-    current: Annotated[float, typer.Option(help="Sim: current in m/s.")] = 0.3,
+    seconds: Annotated[float, Option(help="Sim: duration in seconds.")] = 60.0,
+    current: Annotated[float, Option(help="Sim: current in m/s.")] = 0.3,
     current_to: Annotated[
         float,
-        typer.Option(
-            help="Sim: direction of the current, in degrees to the right; 0: onto the net."
-        ),
+        Option(help="Sim: direction of the current, in degrees to the right; 0: onto the net."),
     ] = 60.0,
-    waves: Annotated[float, typer.Option(help="Sim: amplitude of the waves in metres.")] = 0.1,
+    waves: Annotated[float, Option(help="Sim: amplitude of the waves in metres.")] = 0.1,
     cage_radius: Annotated[
-        float, typer.Option(help="Sim: radius of a round net seen from inside, in metres; 0: flat.")
+        float, Option(help="Sim: radius of a round net seen from inside, in metres; 0: flat.")
     ] = 0.0,
-    net_sway: Annotated[
-        float, typer.Option(help="Sim: amplitude of the net's motion in metres.")
-    ] = 0.0,
-    pilot_gain: Annotated[float, typer.Option(help="Sim: ArduSub's pilot gain.")] = 0.5,
+    net_sway: Annotated[float, Option(help="Sim: amplitude of the net's motion in metres.")] = 0.0,
+    pilot_gain: Annotated[float, Option(help="Sim: ArduSub's pilot gain.")] = 0.5,
     rendered: Annotated[
-        bool, typer.Option("--rendered", help="Sim: render every frame and measure it.")
+        bool, Option("--rendered", help="Sim: render every frame and measure it.")
     ] = False,
     camera: Annotated[
         str | None,
-        typer.Option(
-            help="Sim, rendered: camera that takes the frames; ideal, webcam, action or pal."
-        ),
+        Option(help="Sim, rendered: camera that takes the frames; ideal, webcam, action or pal."),
     ] = None,
     shutter: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="KIND[:MS]",
             help="Sim, rendered: rolling:READOUT:EXPOSURE, interlaced:EXPOSURE, global:EXPOSURE.",
         ),
     ] = None,
-    fps: Annotated[float, typer.Option(help="Sim: frames per second.")] = 25.0,
-    seed: Annotated[int, typer.Option(min=0, help="Sim: random seed of waves and noise.")] = 0,
+    fps: Annotated[float, Option(help="Sim: frames per second.")] = 25.0,
+    seed: Annotated[int, Option(min=0, help="Sim: random seed of waves and noise.")] = 0,
     freeze: Annotated[
-        float | None, typer.Option(help="Sim: freeze the picture from this time on, in seconds.")
+        float | None, Option(help="Sim: freeze the picture from this time on, in seconds.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:

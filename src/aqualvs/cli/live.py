@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from aqualvs.cli.command import (
     Celsius,
@@ -24,89 +25,85 @@ _OF_MAVLINK = ("vehicle_file", "mavlink_peer", "mavlink_key")
 
 def live(
     context: typer.Context,
-    source: Annotated[
-        str, typer.Argument(help="Stream, camera or file; docs/sources.md has a table.")
-    ],
-    rig: Annotated[Path, typer.Option("--rig", help="Rig file (YAML).")],
+    source: Annotated[str, Argument(help="Stream, camera or file; docs/sources.md has a table.")],
+    rig: Annotated[Path, Option("--rig", help="Rig file (YAML).")],
     mavlink: Annotated[
         list[str] | None,
-        typer.Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
+        Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
     ] = None,
     vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,
     mavlink_key: MavlinkKey = None,
     json: Annotated[
-        list[str] | None, typer.Option(help="Send lines of JSON by UDP to HOST:PORT; repeatable.")
+        list[str] | None, Option(help="Send lines of JSON by UDP to HOST:PORT; repeatable.")
     ] = None,
-    ros2: Annotated[bool, typer.Option("--ros2", help="Publish to ROS 2.")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="Publish to ROS 1 (Noetic).")] = False,
+    ros2: Annotated[bool, Option("--ros2", help="Publish to ROS 2.")] = False,
+    ros1: Annotated[bool, Option("--ros1", help="Publish to ROS 1 (Noetic).")] = False,
     foxglove: Annotated[
-        bool, typer.Option("--foxglove", help="Serve Foxglove at ws://127.0.0.1:8765.")
+        bool, Option("--foxglove", help="Serve Foxglove at ws://127.0.0.1:8765.")
     ] = False,
     foxglove_address: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Address of the Foxglove server.")
+        str, Option(metavar="HOST:PORT", help="Address of the Foxglove server.")
     ] = "127.0.0.1:8765",
     rerun: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="viewer|HOST:PORT|FILE.rrd",
             help="Show in Rerun: open a viewer, connect to an open one, or write a file.",
         ),
     ] = None,
     dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Serve the pilot's page at http://127.0.0.1:8100.")
+        bool, Option("--dashboard", help="Serve the pilot's page at http://127.0.0.1:8100.")
     ] = False,
     dashboard_address: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="HOST:PORT",
             help="Address of the pilot's page; any other than 127.0.0.1 needs a token.",
         ),
     ] = "127.0.0.1:8100",
     token: Annotated[
         str | None,
-        typer.Option(
+        Option(
             envvar="AQUALVS_TOKEN",
             help="Password of the page; generated and printed if one is needed.",
         ),
     ] = None,
     embed_from: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             envvar="AQUALVS_EMBED_FROM",
             metavar="ORIGIN",
             help="Let pages of this origin embed the page, such as http://blueos.local; "
             "repeatable.",
         ),
     ] = None,
-    record: Annotated[bool, typer.Option("--record", help="Record from the start.")] = False,
-    record_to: Annotated[Path, typer.Option(help="Folder of recordings.")] = Path("dives"),
+    record: Annotated[bool, Option("--record", help="Record from the start.")] = False,
+    record_to: Annotated[Path, Option(help="Folder of recordings.")] = Path("dives"),
     record_video: Annotated[
-        bool, typer.Option("--record-video", help="Also record the pictures.")
+        bool, Option("--record-video", help="Also record the pictures.")
     ] = False,
     smooth: Annotated[
-        bool, typer.Option("--filter", help="Add time-filtered values; raw values stay available.")
+        bool, Option("--filter", help="Add time-filtered values; raw values stay available.")
     ] = False,
     fast: Annotated[
-        bool, typer.Option("--fast", help="For files: measure every frame, as fast as possible.")
+        bool, Option("--fast", help="For files: measure every frame, as fast as possible.")
     ] = False,
     fps: Annotated[
         float | None,
-        typer.Option(help="Frame rate of images (1 by default), or to request from a camera."),
+        Option(help="Frame rate of images (1 by default), or to request from a camera."),
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Picture size to request from a camera.")
+        str | None, Option(metavar="WxH", help="Picture size to request from a camera.")
     ] = None,
     pixel_format: Annotated[
-        str | None, typer.Option(help="Format to request from a camera: h264, mjpeg, yuyv422.")
+        str | None, Option(help="Format to request from a camera: h264, mjpeg, yuyv422.")
     ] = None,
     transport: Annotated[
-        Literal["tcp", "udp"] | None, typer.Option(help="Transport of RTSP; tcp by default.")
+        Literal["tcp", "udp"] | None, Option(help="Transport of RTSP; tcp by default.")
     ] = None,
     target: Target = "auto",
-    detector: Annotated[Literal["ridge", "threshold"], typer.Option(help="Stripe detector.")] = (
-        "ridge"
-    ),
+    detector: Annotated[Literal["ridge", "threshold"], Option(help="Stripe detector.")] = ("ridge"),
     water_n: WaterIndex = None,
     temperature_c: Celsius = None,
     salinity: Salinity = None,
@@ -164,11 +161,9 @@ def live(
 
 def doctor(
     context: typer.Context,
-    source: Annotated[str | None, typer.Argument(help="Stream, camera or file to check.")] = None,
-    rig: Annotated[
-        Path | None, typer.Option(help="Rig file that the pictures should match.")
-    ] = None,
-    mavlink: Annotated[str | None, typer.Option(help="Autopilot to listen for.")] = None,
+    source: Annotated[str | None, Argument(help="Stream, camera or file to check.")] = None,
+    rig: Annotated[Path | None, Option(help="Rig file that the pictures should match.")] = None,
+    mavlink: Annotated[str | None, Option(help="Autopilot to listen for.")] = None,
     vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,
     mavlink_key: MavlinkKey = None,

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, TextIO
 
 import typer
+from typer import Option
 
 from aqualvs import __version__
 from aqualvs.cli.batch import batch
@@ -41,37 +42,31 @@ class LenientStream:
 
     def write(self, text: str) -> int:
         """Write a text, or drop it after a fault."""
-        if self.fault is None:
-            with self._keeping_fault():
+        try:
+            if self.fault is None:
                 return self._stream.write(text)
+        except OSError as fault:
+            self.fault = fault
         return len(text)
 
     def flush(self) -> None:
         """Flush the stream."""
-        if self.fault is None:
-            with self._keeping_fault():
+        try:
+            if self.fault is None:
                 self._stream.flush()
+        except OSError as fault:
+            self.fault = fault
 
     def __getattr__(self, name: str) -> Any:
         """Return any other attribute of the stream."""
         return getattr(self._stream, name)
-
-    @contextlib.contextmanager
-    def _keeping_fault(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as fault:
-            self.fault = fault
 
 
 @contextlib.contextmanager
 def lenient_output() -> Iterator[LenientStream | None]:
     """Make standard output and error lenient, and able to write every character.
 
-    Yields
-    ------
-    output : LenientStream or None
-        Standard output; None if it is closed.
+    Yields standard output; None if it is closed.
     """
     before = sys.stdout, sys.stderr
     output = None if sys.stdout is None else _lenient(sys.stdout)
@@ -84,14 +79,6 @@ def lenient_output() -> Iterator[LenientStream | None]:
             if stream is not None:
                 stream.flush()
         sys.stdout, sys.stderr = before
-
-
-def drop_output() -> None:
-    """Redirect standard output to the null device, so that the last flush at exit succeeds."""
-    with contextlib.suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
 
 
 def _lenient(stream: TextIO) -> LenientStream:
@@ -240,7 +227,7 @@ _MAX_MESSAGE = 2000
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+    version: Annotated[bool, Option("--version", help="Show the version and exit.")] = False,
 ) -> None:
     if version:
         typer.echo(f"aqualvs {__version__}")
@@ -323,7 +310,11 @@ def _complete(code: int, output: LenientStream | None, *, ends: bool) -> int:
     if fault is None:
         return code
     if ends:
-        drop_output()
+        # So that the last flush at exit succeeds.
+        with contextlib.suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
     if fault.errno == errno.EPIPE:
         return code or _EXIT_BROKEN_PIPE
     return _complain(f"standard output: cannot be written ({fault.strerror})", _EXIT_BAD_INPUT)

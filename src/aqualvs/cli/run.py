@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from aqualvs.cli.command import (
     MAX_WORKERS,
@@ -28,20 +29,20 @@ from aqualvs.cli.command import (
 def net_change(
     runs: Annotated[
         list[Path],
-        typer.Argument(
+        Argument(
             metavar="RUN...", help="Folders of runs that aqualvs net has evaluated, or of batches."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write.")],
     date: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="YYYY-MM-DD|auto",
             help="Date of each dive, in the order of the RUNs; by default from the folder's or "
             "video's name, or the video's clock.",
         ),
     ] = None,
-    cell_m: Annotated[float, typer.Option(help="Side length of the map's cells.")] = 1.0,
+    cell_m: Annotated[float, Option(help="Side length of the map's cells.")] = 1.0,
     overwrite: Overwrite = False,
 ) -> None:
     """Compare a net between dates."""
@@ -55,14 +56,12 @@ def net_change(
 
 def run(
     context: typer.Context,
-    source: Annotated[str, typer.Argument(help="Video, folder of images, address, or recording.")],
+    source: Annotated[str, Argument(help="Video, folder of images, address, or recording.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder to write; by default NAME_run beside the dive."),
+        Option("--out", "-o", help="Folder to write; by default NAME_run beside the dive."),
     ] = None,
-    rig: Annotated[
-        Path | None, typer.Option("--rig", help="Rig file; a recording has its own.")
-    ] = None,
+    rig: Annotated[Path | None, Option("--rig", help="Rig file; a recording has its own.")] = None,
     overwrite: Overwrite = False,
     target: Target = "auto",
     detector: Detector = "ridge",
@@ -73,31 +72,29 @@ def run(
     salinity: Salinity = None,
     dome: Refraction = True,
     frames: Annotated[
-        str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
+        str, Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
     ] = ":",
     fps: Annotated[
-        float | None, typer.Option(help="Frame rate of a folder of images; 1 by default.")
+        float | None, Option(help="Frame rate of a folder of images; 1 by default.")
     ] = None,
-    overlay: Annotated[bool, typer.Option("--overlay", help="Also write overlay.mp4.")] = False,
-    report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
+    overlay: Annotated[bool, Option("--overlay", help="Also write overlay.mp4.")] = False,
+    report: Annotated[bool, Option(help="Write report.html.")] = True,
     truth: Annotated[
-        Path | None, typer.Option(help="CSV with the ground truth, to compare with.")
+        Path | None, Option(help="CSV with the ground truth, to compare with.")
     ] = None,
     index_target: IndexTarget = None,
     net: Annotated[
-        bool, typer.Option("--net", help="Also report the condition of the net, see aqualvs net.")
+        bool, Option("--net", help="Also report the condition of the net, see aqualvs net.")
     ] = False,
     mcap: Annotated[
-        bool, typer.Option("--mcap", help="Also write dive.mcap, for Foxglove and for replays.")
+        bool, Option("--mcap", help="Also write dive.mcap, for Foxglove and for replays.")
     ] = False,
     rerun: Annotated[
-        Path | None, typer.Option(metavar="FILE.rrd", help="Also write a file for Rerun.")
+        Path | None, Option(metavar="FILE.rrd", help="Also write a file for Rerun.")
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=MAX_WORKERS, help="Number of worker processes; one per core by default."
-        ),
+        Option(min=1, max=MAX_WORKERS, help="Number of worker processes; one per core by default."),
     ] = None,
 ) -> None:
     """Measure a dive."""
@@ -133,36 +130,31 @@ def run(
 
 
 def net(
-    source: Annotated[str, typer.Argument(help="Folder of a run, a video, or a folder of images.")],
+    source: Annotated[str, Argument(help="Folder of a run, a video, or a folder of images.")],
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--out",
             "-o",
             help="Folder to write; by default the run's own, or NAME_run beside a dive.",
         ),
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option(help="Rig file, if SOURCE is a dive; a run has its own.")
+        Path | None, Option(help="Rig file, if SOURCE is a dive; a run has its own.")
     ] = None,
     target: Annotated[
         str,
-        typer.Option(
-            metavar="auto|net|solid|FILE", help="As for aqualvs run; only if SOURCE is a dive."
-        ),
+        Option(metavar="auto|net|solid|FILE", help="As for aqualvs run; only if SOURCE is a dive."),
     ] = "auto",
     log: Annotated[
-        Path | None,
-        typer.Option(help="The vehicle's log, for depth and bearing: CSV, .tlog or .BIN."),
+        Path | None, Option(help="The vehicle's log, for depth and bearing: CSV, .tlog or .BIN.")
     ] = None,
     log_offset_s: Annotated[
         float | None,
-        typer.Option(help="The log's clock minus the dive's; by default found from the motion."),
+        Option(help="The log's clock minus the dive's; by default found from the motion."),
     ] = None,
-    twine_mm: Annotated[
-        float | None, typer.Option(help="Diameter of the bare twine, if known.")
-    ] = None,
-    stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
+    twine_mm: Annotated[float | None, Option(help="Diameter of the bare twine, if known.")] = None,
+    stretch_m: Annotated[float, Option(help="Length of a stretch of net.")] = 0.5,
     overwrite: Overwrite = False,
 ) -> None:
     """Report the condition of a net."""
@@ -175,22 +167,18 @@ def net(
 
 
 def figures(
-    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    folder: Annotated[Path, Argument(help="Folder of the run.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "-o", help="Folder to write; by default figures in the run's folder."
-        ),
+        Option("--out", "-o", help="Folder to write; by default figures in the run's folder."),
     ] = None,
-    frame: Annotated[
-        int | None, typer.Option(help="Frame; by default the one that shows most.")
-    ] = None,
+    frame: Annotated[int | None, Option(help="Frame; by default the one that shows most.")] = None,
     laser: Annotated[
-        str | None, typer.Option(help="Name of the laser; by default the one that shows most.")
+        str | None, Option(help="Name of the laser; by default the one that shows most.")
     ] = None,
     target: Annotated[
         Path | None,
-        typer.Option(help="Target file (net.yaml) with the parameters of the paper's filter."),
+        Option(help="Target file (net.yaml) with the parameters of the paper's filter."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -209,12 +197,10 @@ def figures(
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    folder: Annotated[Path, Argument(help="Folder of the run.")],
     truth: Annotated[
         Path | None,
-        typer.Option(
-            help="CSV with the ground truth to show; aqualvs net rewrites the page without it."
-        ),
+        Option(help="CSV with the ground truth to show; aqualvs net rewrites the page without it."),
     ] = None,
 ) -> None:
     """Rewrite a report."""
@@ -229,22 +215,22 @@ def report(
 
 
 def simulate(
-    scenario: Annotated[str | None, typer.Argument(help="Scenario name or YAML file.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
-    rig: Annotated[Path | None, typer.Option(help="Rig file; by default the example rig.")] = None,
+    scenario: Annotated[str | None, Argument(help="Scenario name or YAML file.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder to write.")] = None,
+    rig: Annotated[Path | None, Option(help="Rig file; by default the example rig.")] = None,
     camera: Annotated[
-        str, typer.Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
+        str, Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
     ] = "ideal",
     shutter: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="KIND:MS",
             help="Shutter of the camera, in milliseconds: rolling:READOUT:EXPOSURE, "
             "interlaced:EXPOSURE or global:EXPOSURE; by default the rig's.",
         ),
     ] = None,
     overwrite: Overwrite = False,
-    list_: Annotated[bool, typer.Option("--list", help="List the scenarios and exit.")] = False,
+    list_: Annotated[bool, Option("--list", help="List the scenarios and exit.")] = False,
 ) -> None:
     """Render a dive."""
     from aqualvs.experiments import simulate as body
@@ -259,7 +245,7 @@ def simulate(
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("out/demo"),
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write.")] = Path("out/demo"),
     overwrite: Overwrite = False,
 ) -> None:
     """Run the bundled dive."""
@@ -269,10 +255,10 @@ def demo(
 
 
 def check(
-    rig: Annotated[Path, typer.Argument(help="Rig file (YAML).")],
+    rig: Annotated[Path, Argument(help="Rig file (YAML).")],
     against: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="last|FILE",
             help="Report what has moved since the last calibration, or since an older rig file.",
         ),

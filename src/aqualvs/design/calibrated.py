@@ -43,17 +43,9 @@ _BOARD = _BoardOptions()
 def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
     """Return the posture errors by the camera's tolerances after a calibration of the lasers.
 
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers.
-    ranges : sequence of float
-        Walls square ahead, metres.
-
-    Returns
-    -------
-    mapping from cause to array, shape (W, 3)
-        Standard deviations of (range, pitch, yaw), m and rad; NaN if lasers light no board.
+    By cause, shape (W, 3): standard deviations of (range, pitch, yaw), m and rad, on walls square
+    ahead at `ranges` (metres); NaN if lasers light no board. `design` has the final tilts of its
+    lasers.
     """
     rig = design.nominal_rig()
     walls = [WallView.ahead(rig, wall) for wall in ranges]
@@ -94,20 +86,9 @@ def _steps(rig: Rig, tolerances: Tolerances) -> dict[str, list[Mapping[str, floa
 def lasers_by(assumed: Rig, true: Rig) -> Rig | None:
     """Return a rig with lasers calibrated by its own camera in the pictures of another rig.
 
-    The calibration is without noise: the assumed camera gives the poses of boards in the working
-    range, and the stripes on the boards give the lasers.
-
-    Parameters
-    ----------
-    assumed : Rig
-        Rig whose camera the calibration assumes.
-    true : Rig
-        Rig that takes the pictures.
-
-    Returns
-    -------
-    Rig or None
-        None if the boards, or the stripes on them, cannot be used.
+    The calibration is without noise: the camera of `assumed` gives the poses of boards in the
+    working range in pictures that `true` takes, and the stripes on the boards give the lasers. None
+    if the boards, or the stripes on them, cannot be used.
     """
     lit: list[list[FloatArray]] = [[] for _ in true.lasers]
     for board in _boards(true.working_range):
@@ -206,13 +187,7 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
     """Return the errors by offsets of the lens, from zero to the largest possible in the dome.
 
     Among them are the design's own offset and its centring tolerance. Empty without a dome.
-
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers.
-    ranges : sequence of float
-        Walls square ahead, metres.
+    `design` has the final tilts of its lasers; `ranges` are those of walls square ahead, in metres.
     """
     dome = design.rig.dome
     if dome is None:

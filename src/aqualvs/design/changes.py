@@ -9,13 +9,15 @@ Changes: each one is tried with the lasers' angles optimised again (`changes`).
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.design.judge import Judge, StripeSet, predict, score
 from aqualvs.design.settings import Design, Mount, tangential
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 
 TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
@@ -96,11 +98,14 @@ def _candidates(mount: Mount, i_grid: int, halfway: float) -> list[Mount]:
     if mount.free_stripe:
         whole = np.arange(0.0, math.pi - 1e-9, _STRIPE_STEPS[0]).tolist()
         stripes = whole if first else _around(mount.stripe, _STRIPE_STEPS[i_grid], _HALF_STRIPES)
+    # A stripe is turned only as far as half of the baseline remains: one whose sheet passes the
+    # lens does not move with range.
+    least = 0.5 * math.hypot(mount.position[0], mount.position[2]) if mount.free_stripe else 0.0
+    turned = [replace(mount, stripe=stripe % math.pi) for stripe in stripes]
     return [
-        replace(mount, tilt=float(np.clip(tilt, *TILT_LIMITS)), stripe=stripe % math.pi).aimed_at(
-            halfway
-        )
-        for stripe in stripes
+        replace(one, tilt=float(np.clip(tilt, *TILT_LIMITS))).aimed_at(halfway)
+        for one in turned
+        if one.baseline >= least
         for tilt in tilts
     ]
 
@@ -127,8 +132,7 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(NamedTuple):
     """Effect of a change of a design; all numbers are ratios of errors, after to before."""
 
     words: str  # Description of the change.
@@ -156,7 +160,7 @@ def changes(design: Design) -> list[Change]:
     return sorted(found, key=lambda change: change.score)
 
 
-def _measures(design: Design) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _measures(design: Design) -> FloatArray:
     """Return the score, then noise and tolerances for range (as a share) and angles."""
     errors = predict(design)
     parts = [score(design).error]
@@ -166,7 +170,7 @@ def _measures(design: Design) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     return np.array(parts)
 
 
-def _rms(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -174,12 +178,9 @@ def _for_mounts(design: Design, change: Callable[[Mount], Mount]) -> Design:
     return design.with_mounts([change(mount) for mount in design.mounts])
 
 
-def _wider_baseline(design: Design) -> Design:
-    def move(mount: Mount) -> Mount:
-        x, y, z = mount.position
-        return replace(mount, position=(1.2 * x, y, 1.2 * z))
-
-    return _for_mounts(design, move)
+def _moved_out(mount: Mount) -> Mount:
+    x, y, z = mount.position
+    return replace(mount, position=(1.2 * x, y, 1.2 * z))
 
 
 def _finer(design: Design) -> Design:
@@ -202,28 +203,19 @@ def _longer_lens(share: float) -> Callable[[Design], Design]:
 
 def _one_more(design: Design) -> Design | None:
     """Add a laser at the best free place across the axis from an existing one."""
-    tried = [
-        best_angles(design.with_mounts([*design.mounts, _new_mount(design, place)]), quick=True)
-        for place in _free_places(design)
-    ]
-    return min(tried, key=lambda one: score(one).total, default=None)
-
-
-def _new_mount(design: Design, place: tuple[float, float, float]) -> Mount:
     names = {mount.name for mount in design.mounts}
     name = next(name for name in (f"extra_{i}" for i in range(1, 99)) if name not in names)
     tilt, fan = design.mounts[0].tilt, design.mounts[0].fan
-    return Mount(name=name, position=place, stripe=tangential(place), tilt=tilt, fan=fan)
-
-
-def _free_places(design: Design) -> Iterator[tuple[float, float, float]]:
     places = [mount.position for mount in design.mounts]
     # Least distance between lasers, in metres.
     room = 0.03
-    for x, y, z in places:
-        across = (-x, y, -z)
-        if all(math.dist(across, other) > room for other in places):
-            yield across
+    added = [
+        Mount(name=name, position=place, stripe=tangential(place), tilt=tilt, fan=fan)
+        for place in ((-x, y, -z) for x, y, z in places)
+        if all(math.dist(place, other) > room for other in places)
+    ]
+    tried = (best_angles(design.with_mounts([*design.mounts, one]), quick=True) for one in added)
+    return min(tried, key=lambda one: score(one).total, default=None)
 
 
 def _turned(design: Design) -> Design | None:
@@ -266,7 +258,7 @@ def _nearer(design: Design) -> Design | None:
 
 
 _CHANGES: dict[str, Callable[[Design], Design | None]] = {
-    "baseline 20 % longer": _wider_baseline,
+    "baseline 20 % longer": lambda design: _for_mounts(design, _moved_out),
     "twice the pixels, each way": _finer,
     "focal length 25 % longer": _longer_lens(1.25),
     "focal length 20 % shorter": _longer_lens(0.8),

@@ -13,10 +13,10 @@ from rich.table import Table
 from aqualvs.design.calibrated import camera_errors, offset_costs
 from aqualvs.design.changes import best_angles, changes
 from aqualvs.design.file import (
+    EXAMPLE,
     FAN_DEG,
     design_from,
     design_of_rig,
-    example_content,
     load_design,
     merged_content,
 )
@@ -46,6 +46,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.results.files import Claim, writing
+from aqualvs.yamlfile import parse_yaml
 
 RIG_YAML = "rig.yaml"
 
@@ -180,7 +181,7 @@ def _requested_design(request: DesignRequest) -> Design:
         return design_of_rig(load_rig(request.rig), request.fan_deg or FAN_DEG)
     if request.design is not None:
         return load_design(request.design, request.given)
-    content = merged_content(example_content(), request.given)
+    content = merged_content(parse_yaml(EXAMPLE, "the example", OptionError), request.given)
     return design_from(content, name="design", folder=Path())
 
 

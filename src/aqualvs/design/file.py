@@ -37,7 +37,7 @@ from aqualvs.schema import (
     parse_settings,
     si_values,
 )
-from aqualvs.yamlfile import parse_yaml, read_yaml
+from aqualvs.yamlfile import read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
 FAN_DEG = 68.0
@@ -199,12 +199,6 @@ def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
     return design_from(merged, name=str(path), folder=path.parent)
 
 
-def example_content() -> dict[str, Any]:
-    """Return the content of `EXAMPLE`."""
-    content: dict[str, Any] = parse_yaml(EXAMPLE, "the example", OptionError)
-    return content
-
-
 def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a file with some values replaced; `given` maps a part to its keys.
 
@@ -230,21 +224,10 @@ def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict
 
 
 def design_from(content: object, *, name: str, folder: Path) -> Design:
-    """Return the design that the content of a design file describes.
+    """Return the design that the content of a design file, as read from YAML, describes.
 
-    Parameters
-    ----------
-    content : object
-        Content of the YAML file.
-    name : str
-        Name in messages.
-    folder : Path
-        Folder that the path of a rig file in it is relative to.
-
-    Raises
-    ------
-    OptionError, RigError
-        One line: file, place, value, remedy.
+    `name` stands in messages; the path of a rig file in it is relative to `folder`. Raises
+    `OptionError` or `RigError` with one line: file, place, value, remedy.
     """
     file = parse_settings(content, DesignFile, KEY, VERSION, name)
     try:
@@ -286,12 +269,21 @@ def _design(file: DesignFile, folder: Path) -> Design:
         shutter=shutter,
     )
     rig.camera()
+    tolerances = file.tolerances
     return Design(
         rig=rig,
         mounts=_mounts(file),
         centring=file.lens.centring_mm / _MM,
         noise=Noise(**si_values(file.noise)),
-        tolerances=_tolerances(file.tolerances),
+        tolerances=Tolerances(
+            lens=tolerances.lens_mm / _MM,
+            rotation=math.radians(tolerances.rotation_deg),
+            focal=tolerances.focal_percent / 100.0,
+            dome=tolerances.dome_mm / _MM,
+            n_water=tolerances.n_water,
+            laser_angle=math.radians(tolerances.laser_deg),
+            laser_offset=tolerances.laser_mm / _MM,
+        ),
         net=NominalNet(**si_values(file.net)),
         goals=Goals(
             range_share=file.goals.range_percent / 100.0, angle=math.radians(file.goals.angle_deg)
@@ -363,16 +355,4 @@ def _mount(part: MountPart) -> Mount:
         fan=math.radians(part.fan_deg),
         free_tilt=part.tilt_deg is None,
         free_stripe=given == "best",
-    )
-
-
-def _tolerances(part: TolerancesPart) -> Tolerances:
-    return Tolerances(
-        lens=part.lens_mm / _MM,
-        rotation=math.radians(part.rotation_deg),
-        focal=part.focal_percent / 100.0,
-        dome=part.dome_mm / _MM,
-        n_water=part.n_water,
-        laser_angle=math.radians(part.laser_deg),
-        laser_offset=part.laser_mm / _MM,
     )

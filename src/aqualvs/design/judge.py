@@ -63,7 +63,9 @@ def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) 
     walls = design.ranges if ranges is None else np.asarray(ranges, np.float64)
     camera = design.rig.camera()
     stripes = see_stripes(camera, design.mounts, walls, index_step(camera, design.tolerances))
-    solid, mesh = wall_parts(stripes, design.noise).total(), net_sums(stripes, design)
+    solid, mesh = wall_parts(stripes, design.noise).total(), net_parts(stripes, design).total()
+    twine = outer(twine_pulls(stripes, design).sum(axis=0)[..., None, :])
+    mesh = Sums(mesh.matrix, mesh.scatter + twine)
     return PredictedErrors(
         ranges=walls,
         stripes=stripes,
@@ -121,13 +123,6 @@ def net_share(stripes: Stripes, design: Design) -> FloatArray:
     return np.minimum(strands / np.maximum(stripes.lines, 1.0), 1.0)
 
 
-def net_sums(stripes: Stripes, design: Design) -> Sums:
-    """Return the sums of all stripes on the design's net."""
-    sums = net_parts(stripes, design).total()
-    twine = outer(twine_pulls(stripes, design).sum(axis=0)[..., None, :])
-    return Sums(sums.matrix, sums.scatter + twine)
-
-
 def twine_pulls(stripes: Stripes, design: Design) -> FloatArray:
     """Return the effect (K, W, 3) on each stripe's sums of the shift that all strands share.
 
@@ -155,35 +150,24 @@ def outer(pulls: FloatArray) -> FloatArray:
     return summed
 
 
-def laser_scatter(stripes: Stripes, tolerances: Tolerances) -> FloatArray:
-    """Return the scatter by errors of each laser's plane, shape (K, W, 3, 3)."""
-    sizes = np.array([tolerances.laser_angle, tolerances.laser_angle, tolerances.laser_offset])
-    return outer(stripes.own[..., 2:, :] * sizes[:, None])
-
-
 def posture_covariance(sums: Sums, ranges: FloatArray) -> FloatArray:
     """Return the covariance (..., W, 3, 3) of range, pitch and yaw; NaN if undetermined.
 
     The posture's derivatives by m at a wall square ahead are -range², range and range.
     """
-    inverse = inverse_of(sums.matrix)
+    size = np.trace(sums.matrix, axis1=-2, axis2=-1)
+    known = np.isfinite(size) & (size > 0.0)
+    safe = np.where(known[..., None, None], sums.matrix, np.eye(3))
+    # Below this share of the trace a direction is not determined.
+    singular = 1e-9
+    known &= np.linalg.eigvalsh(safe)[..., 0] > singular * np.where(known, size, 1.0)
+    inverse = np.linalg.inv(np.where(known[..., None, None], safe, np.eye(3)))
+    inverse = np.where(known[..., None, None], inverse, np.nan)
     covariance = inverse @ sums.scatter @ inverse
     order = [1, 2, 0]
     scale = np.stack([-(ranges**2), ranges, ranges], axis=-1)
     picked = covariance[..., order, :][..., :, order]
     return picked * scale[..., :, None] * scale[..., None, :]
-
-
-def inverse_of(matrix: FloatArray) -> FloatArray:
-    """Invert symmetric matrices (..., 3, 3); NaN where a direction is not determined."""
-    size = np.trace(matrix, axis1=-2, axis2=-1)
-    known = np.isfinite(size) & (size > 0.0)
-    safe = np.where(known[..., None, None], matrix, np.eye(3))
-    least = np.linalg.eigvalsh(safe)[..., 0]
-    singular = 1e-9
-    known &= least > singular * np.where(known, size, 1.0)
-    inverse = np.linalg.inv(np.where(known[..., None, None], safe, np.eye(3)))
-    return np.where(known[..., None, None], inverse, np.nan)
 
 
 def crossings(stripes: Stripes) -> BoolArray:
@@ -290,7 +274,9 @@ class Judge:
         """Return the stripes of mounts in the picture, with a margin for oblique targets."""
         design, margin = self._design, _MARGIN_SHARE * self._height
         stripes = see_stripes(self._camera, mounts, self._ranges, self._steps, margin)
-        scatter = laser_scatter(stripes, design.tolerances)
+        # By errors of each laser's plane, shape (K, W, 3, 3).
+        angle, offset = design.tolerances.laser_angle, design.tolerances.laser_offset
+        scatter = outer(stripes.own[..., 2:, :] * np.array([angle, angle, offset])[:, None])
         share = net_share(stripes, design)[..., None, None]
         wall, net = wall_parts(stripes, design.noise), net_parts(stripes, design)
         on_wall = wall.matrix, wall.scatter + scatter, stripes.common

@@ -18,7 +18,7 @@ from aqualvs.check.finding import escaped, number_table, shutter_finding
 from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost
 from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
-from aqualvs.design.settings import Design, Mount
+from aqualvs.design.settings import Design
 from aqualvs.geometry.arrays import BoolArray, FloatArray, runs_of
 from aqualvs.report import html
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas, save_figures
@@ -257,15 +257,8 @@ def change_table(found: Sequence[Change]) -> Table:
     names = ("\nchange", "\nall", "noise\nrange", "\nangle", "tolerances\nrange", "\nangle")
     title = "Change of the errors in per cent by a change of the rig, lasers tilted anew"
     table = number_table(title, *names, texts=["\nchange"])
-    for one in found:
-        values = (
-            one.score,
-            one.noise_range,
-            one.noise_angle,
-            one.systematic_range,
-            one.systematic_angle,
-        )
-        table.add_row(one.words, *(_change(value) for value in values))
+    for words, *shares in found:
+        table.add_row(words, *map(_change, shares))
     return table
 
 
@@ -285,7 +278,9 @@ def findings(design: Design, errors: PredictedErrors) -> list[str]:
         lines.append(f"There is {_posture_text(errors)} in the working range.")
     for mount, visible in zip(design.mounts, errors.visible, strict=True):
         if not visible.all():
-            lines.append(_visibility_text(mount, errors.ranges, visible))
+            where = f"in the picture at {_interval(errors.ranges, visible)} mm only"
+            seen = f"is {where}" if visible.any() else "is never in the picture"
+            lines.append(f"Laser '{mount.name}' {seen}; where it is not, its points are missing.")
     names = [mount.name for mount in design.mounts]
     pairs = [
         f"{names[i]} and {names[j]} at {_interval(errors.ranges, errors.crossing[i, j])} mm"
@@ -301,12 +296,6 @@ def findings(design: Design, errors: PredictedErrors) -> list[str]:
     return lines
 
 
-def _visibility_text(mount: Mount, ranges: FloatArray, visible: BoolArray) -> str:
-    where = _interval(ranges, visible)
-    seen = f"is in the picture at {where} mm only" if visible.any() else "is never in the picture"
-    return f"Laser '{mount.name}' {seen}; where it is not, its points are missing."
-
-
 ERRORS_PNG, PICTURE_PNG, DESIGN_HTML = "errors.png", "picture.png", "design.html"
 
 # Ranges of the plotted errors; points along a drawn stripe.
@@ -314,21 +303,10 @@ _N_RANGES, _N_ALONG = 60, 40
 
 
 def draw_figures(design: Design, by_camera: Mapping[str, FloatArray], out: Path) -> list[Path]:
-    """Write `errors.png` and `picture.png`.
+    """Write `errors.png` and `picture.png` into a folder that exists.
 
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers.
-    by_camera : mapping from cause to array
-        From `camera_errors`, at `shown_ranges`; it changes little with range.
-    out : Path
-        Folder that exists.
-
-    Raises
-    ------
-    OSError
-        If a picture cannot be written.
+    `design` has the final tilts of its lasers; `by_camera` is from `camera_errors`, at
+    `shown_ranges`, and changes little with range. Raises `OSError` if a picture cannot be written.
     """
     from matplotlib import rc_context
 

@@ -85,26 +85,20 @@ def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, .
     """Return mounts evenly spaced around the forward axis, their stripes tangential to the circle.
 
     The first is below. Two are put below and beside, because opposite ones draw parallel stripes.
-
-    Parameters
-    ----------
-    count : int
-        Number of lasers.
-    baseline : float
-        Distance from the forward axis, metres.
-    back : float
-        Distance behind the dome's centre, metres.
-    fan : float
-        Full fan angle, radians.
+    The `baseline` is the distance from the forward axis, `back` that behind the dome's centre, in
+    metres; `fan` is the full fan angle in radians.
     """
     step = math.tau / count if count > 2 else math.pi / 2
     mounts = []
     for i in range(count):
         polar = -math.pi / 2 - i * step
+        x, z = math.cos(polar), math.sin(polar)
+        upright = "lower" if z < -0.4 else "upper" if z > 0.4 else ""
+        level = "left" if x < -0.4 else "right" if x > 0.4 else ""
         mounts.append(
             Mount(
-                name=_place_name(polar, i),
-                position=(baseline * math.cos(polar), -back, baseline * math.sin(polar)),
+                name="_".join(filter(None, (upright, level))) or f"laser_{i + 1}",
+                position=(baseline * x, -back, baseline * z),
                 stripe=_line_direction(polar + math.pi / 2),
                 tilt=0.0,
                 fan=fan,
@@ -123,19 +117,9 @@ def tangential(position: Sequence[float]) -> float:
 def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     """Return a mount for a laser of a rig, with defaults for values that its plane does not give.
 
-    Parameters
-    ----------
-    laser : Laser
-        Behind a window the plane that fits its light best is used.
-    rig : Rig
-        The laser's rig.
-    fan : float
-        Full fan angle, radians.
-
-    Raises
-    ------
-    RigError
-        If the laser's sheet is square to the view, so that it draws no stripe.
+    Behind a window the plane that fits the laser's light best is used. `fan`: full fan angle,
+    radians. Raises `RigError` if the laser's sheet is square to the view, so that it draws no
+    stripe.
     """
     sheet = sheet_in(laser, rig.n_air, rig.n_water)
     plane = sheet.best_plane(rig.camera(), rig.working_range)
@@ -177,14 +161,6 @@ def _line_direction(angle: float) -> float:
     """Return the direction of a line between 0 and pi; just below pi, by rounding, is 0."""
     turned = angle % math.pi
     return 0.0 if math.pi - turned < 1e-12 else turned
-
-
-def _place_name(polar: float, i: int) -> str:
-    """Return a name for a position around the axis, such as "lower_left"; `polar` in radians."""
-    x, z = math.cos(polar), math.sin(polar)
-    upright = "lower" if z < -0.4 else "upper" if z > 0.4 else ""
-    level = "left" if x < -0.4 else "right" if x > 0.4 else ""
-    return "_".join(word for word in (upright, level) if word) or f"laser_{i + 1}"
 
 
 N_WALLS = 9

@@ -68,14 +68,8 @@ def see_stripes(
 ) -> Stripes:
     """Return the sums over a camera's view of the stripes of K mounts on walls square ahead.
 
-    Parameters
-    ----------
-    ranges : array, shape (W,)
-        Metres.
-    common : array, shape (P, G)
-        G errors of the camera as steps of its parameters, see `parameter_names`.
-    margin : float
-        Width of the ignored border of the picture, in pixels.
+    `ranges`, shape (W,): metres. `common`, shape (P, G): G errors of the camera as steps of its
+    parameters, see `parameter_names`. `margin`: width of the picture's ignored border, in pixels.
     """
     axes = [mount.axes for mount in mounts]
     along, beam = (np.array([one[i] for one in axes]).reshape(-1, 3) for i in (0, 2))
@@ -85,17 +79,7 @@ def see_stripes(
     reach = np.array([_reach(mount) for mount in mounts]).reshape(-1, 2)
     fan = np.where((distance > 0.0)[..., None], distance[..., None] * reach[:, None], np.nan)
     ends = _visible_ends(camera, centre, along, fan, margin)
-    return _summed(camera, _Lines(centre, along, beam, ends), ranges, common)
-
-
-@dataclass(frozen=True, slots=True)
-class _Lines:
-    """Stripes on walls: as in `Stripes`, and the beams (K, 3)."""
-
-    centre: FloatArray
-    along: FloatArray
-    beam: FloatArray
-    ends: FloatArray
+    return _summed(camera, centre, along, beam, ends, ranges, common)
 
 
 def _reach(mount: Mount) -> tuple[float, float]:
@@ -111,10 +95,15 @@ def _visible_ends(
 ) -> FloatArray:
     """Return the ends (K, W, 2) of the visible part along the stripe, in metres; NaN if none."""
     share = np.linspace(0.0, 1.0, _N_SEARCH)
+    (width, height), free = camera.size_px, 2.0 * margin
     # The first pass covers the whole fan, which may be much wider than the picture.
     for _ in range(_N_PASSES):
         place = fan[..., :1] + share * (fan[..., 1:] - fan[..., :1])
-        inside = _depth_in_picture(camera, _points(centre, along, place), margin)
+        pixels, valid = camera.project(_points(centre, along, place))
+        x, y = pixels[..., 0] + 0.5 - margin, pixels[..., 1] + 0.5 - margin
+        # Distance to the picture's border in pixels, negative outside; NaN if not seen.
+        inside = np.minimum(np.minimum(x, width - free - x), np.minimum(y, height - free - y))
+        inside = np.where(valid, inside, np.nan)
         seen = inside > 0.0
         first = np.argmax(seen, axis=-1)
         last = _N_SEARCH - 1 - np.argmax(seen[..., ::-1], axis=-1)
@@ -128,16 +117,6 @@ def _visible_ends(
 
 def _points(centre: FloatArray, along: FloatArray, place: FloatArray) -> FloatArray:
     return centre[..., None, :] + place[..., None] * along[:, None, None, :]
-
-
-def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> FloatArray:
-    """Return the distance to the picture's border in pixels, negative outside; NaN if not seen."""
-    pixels, valid = camera.project(points)
-    width, height = camera.size_px
-    x, y = pixels[..., 0] + 0.5 - margin, pixels[..., 1] + 0.5 - margin
-    free = 2.0 * margin
-    depth = np.minimum(np.minimum(x, width - free - x), np.minimum(y, height - free - y))
-    return np.where(valid, depth, np.nan)
 
 
 def _at(values: FloatArray, i: IntArray) -> FloatArray:
@@ -157,27 +136,42 @@ def _edge(place: FloatArray, inside: FloatArray, i: IntArray, step: int) -> Floa
     return at + share * (to - at)
 
 
-def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray) -> Stripes:
-    """Integrate the sums over the visible parts of stripes; see `Stripes`."""
-    centre, along, ends = line.centre, line.along, line.ends
+def _summed(
+    camera: Camera,
+    centre: FloatArray,
+    along: FloatArray,
+    beam: FloatArray,
+    ends: FloatArray,
+    ranges: FloatArray,
+    common: FloatArray,
+) -> Stripes:
+    """Integrate the sums over the visible parts of stripes; see `Stripes`. Beams: shape (K, 3)."""
     node, weight = np.polynomial.legendre.leggauss(_N_SUM)
     half = 0.5 * (ends[..., 1:] - ends[..., :1])
     points = _points(centre, along, 0.5 * ends.sum(axis=-1, keepdims=True) + half * node)
     pixels, valid, by_point, by_parameter = camera.project_with_parameter_jacobian(points)
     seen: BoolArray = np.asarray(valid.all(axis=-1))
     path = np.einsum("kwsij,kj->kwsi", by_point, along)
-    is_row = _along_x(path)
+    # The scanner searches upright stripes by rows.
+    across, down = (np.abs(path[..., i]).mean(axis=-1) for i in range(2))
+    is_row: BoolArray = (down > across)[..., None]
     lines = np.abs(np.where(is_row, path[..., 1], path[..., 0])) * (weight * half)
     lines = lines / pixels_per_line(camera.size_px)
-    normal = np.cross(along, line.beam)
+    normal = np.cross(along, beam)
     sensitivity = _Sensitivity.of(normal, ranges, by_point, by_parameter @ common)
     per_px = np.where(is_row, sensitivity.by_x, sensitivity.by_y)
-    place = _place(camera, pixels, is_row)
+    # Positions along the stripe, from -1 at one border of the picture to 1 at the other.
+    x, y = (2.0 * pixels[..., i] / (camera.size_px[i] - 1) - 1.0 for i in range(2))
+    place = np.where(is_row, y, x)
     # A stripe without depth (its sheet runs through the lens) has no information.
     with np.errstate(divide="ignore", invalid="ignore"):
         line_weight = np.where(seen[..., None] & (per_px != 0.0), lines / per_px**2, 0.0)
     weighted = line_weight[..., None] * np.where(np.isfinite(points), points, 0.0)
-    by_error = _own(sensitivity, points, line, per_px, place)
+    # A normal that turns towards t moves the sheet by -t·X along the old normal.
+    turned = -np.stack([np.einsum("kwsi,ki->kws", points, t) for t in (along, beam)], axis=-1)
+    by_normal = sensitivity.by_normal[..., None]
+    pixel = np.stack([per_px, per_px * place], axis=-1)
+    by_error = np.concatenate([pixel, turned * by_normal, by_normal], axis=-1)
     safe = [np.where(np.isfinite(a), a, 0.0) for a in (points, by_error, sensitivity.by_common)]
     return Stripes(
         lines=np.where(seen, lines.sum(axis=-1), 0.0),
@@ -189,20 +183,6 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
         along=along,
         ends=np.where(seen[..., None], ends, np.nan),
     )
-
-
-def _along_x(path: FloatArray) -> BoolArray:
-    """Return the mask (K, W, 1) of upright stripes, which the scanner searches by rows."""
-    x, y = np.abs(path[..., 0]).mean(axis=-1), np.abs(path[..., 1]).mean(axis=-1)
-    upright: BoolArray = (y > x)[..., None]
-    return upright
-
-
-def _place(camera: Camera, pixels: FloatArray, is_row: BoolArray) -> FloatArray:
-    """Return positions along the stripe, from -1 at one border of the picture to 1 at the other."""
-    width, height = camera.size_px
-    x, y = 2.0 * pixels[..., 0] / (width - 1) - 1.0, 2.0 * pixels[..., 1] / (height - 1) - 1.0
-    return np.where(is_row, y, x)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,40 +206,15 @@ class _Sensitivity:
         normal = normals[:, None, None, :]
         # Only the forward part of dX changes m·X = y / range.
         x_n, n_y = _cross_y(row_y, normal), _cross_y(normal, row_x)
-        forward = _cross_y(row_x, row_y)
+        across = np.cross(row_x, row_y)
         with np.errstate(divide="ignore", invalid="ignore"):
-            volume = _volume(normal, row_x, row_y) * ranges[None, :, None]
-            by_x, by_y, by_normal = x_n / volume, n_y / volume, forward / volume
+            x, y, z = (normal[..., i] * across[..., i] for i in range(3))
+            volume = (x + y + z) * ranges[None, :, None]
+            by_x, by_y, by_normal = x_n / volume, n_y / volume, across[..., 1] / volume
             # At a fixed pixel a step of the camera acts like the opposite step of the pixel.
             by_common = -(by_x[..., None] * steps[..., 0, :] + by_y[..., None] * steps[..., 1, :])
         return cls(by_x, by_y, by_normal, by_common)
 
 
-def _volume(n: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    volume: FloatArray = (
-        n[..., 0] * (a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1])
-        + n[..., 1] * _cross_y(a, b)
-        + n[..., 2] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-    )
-    return volume
-
-
 def _cross_y(a: FloatArray, b: FloatArray) -> FloatArray:
     return a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-
-
-def _own(
-    sensitivity: _Sensitivity,
-    points: FloatArray,
-    line: _Lines,
-    per_px: FloatArray,
-    place: FloatArray,
-) -> FloatArray:
-    """Return d(m·X)/d(error) for `OWN_ERRORS`, shape (K, W, S, 5)."""
-    # A normal that turns towards t moves the sheet by -t·X along the old normal.
-    turned = -np.stack(
-        [np.einsum("kwsi,ki->kws", points, t) for t in (line.along, line.beam)], axis=-1
-    )
-    by_normal = sensitivity.by_normal[..., None]
-    pixel = np.stack([per_px, per_px * place], axis=-1)
-    return np.concatenate([pixel, turned * by_normal, by_normal], axis=-1)

@@ -31,7 +31,7 @@ from aqualvs.pipeline import run
 from aqualvs.results.files import Claim, without_nan, writing
 from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import RunRequest, scanner_options
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.benchmark import VISIBLE_LIMIT
 from aqualvs.terminal import Echo
 from aqualvs.text import count_text

@@ -163,21 +163,27 @@ _LAZY_S_PER_BYTE = 1e-4
 its callees: a quarter of the compile time (3 kB and 1.2 s in the median of 22 kernels)."""
 
 
-class _LazyKernel:
-    """A function that Python runs for a while before it is compiled, unless its code is on disk."""
+class _Kernel:
+    """A function that is compiled on demand: most programs call few kernels that they import."""
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, object]) -> None:
-        functools.update_wrapper(self, function)
+        functools.update_wrapper(cast(Any, self), function)
         self.py_func = function
         self._options = options
         _stamp_of(function.__code__.co_filename)
+
+
+class _LazyKernel(_Kernel):
+    """A function that Python runs for a while before it is compiled, unless its code is on disk."""
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, object]) -> None:
+        super().__init__(function, options)
         self._run = self._run_first
         self._left_s = 0.0
 
     def __call__(self, *arguments: Any) -> Any:
         return self._run(*arguments)
 
-    # Made on demand: most programs call few of the kernels that they import.
     @functools.cached_property
     def _compiled(self) -> Callable[..., Any]:
         return _compiled(self.py_func, **self._options)
@@ -272,20 +278,14 @@ def _native(result: Any) -> Any:
     return result
 
 
-class _InnerKernel:
+class _InnerKernel(_Kernel):
     """A function that is compiled once for kernels, and once more if Python calls it."""
-
-    def __init__(self, function: Callable[..., Any], options: Mapping[str, object]) -> None:
-        functools.update_wrapper(self, function)
-        self.py_func = function
-        self._options = options
-        _stamp_of(function.__code__.co_filename)
 
     def __call__(self, *arguments: Any) -> Any:
         run = self.py_func if _interpreter.runs else self._for_python
         return run(*arguments)
 
-    # Made on demand: kernels that are loaded from disk already contain its code.
+    # Kernels that are loaded from disk already contain its code.
     @functools.cached_property
     def _for_kernels(self) -> Callable[..., Any]:
         return _compiled(self.py_func, no_cpython_wrapper=True, **self._options)
@@ -294,29 +294,16 @@ class _InnerKernel:
     def _for_python(self) -> Callable[..., Any]:
         # Numba names cache files by qualified name: under the same one, a process could load the
         # code without a wrapper for Python, and crash.
-        function = self.py_func
-        own = types.FunctionType(
-            function.__code__,
-            function.__globals__,
-            function.__name__,
-            function.__defaults__,
-            function.__closure__,
-        )
+        function: Any = self.py_func
+        names = ("code", "globals", "name", "defaults", "closure")
+        own = types.FunctionType(*(getattr(function, f"__{name}__") for name in names))
         functools.update_wrapper(own, function)
         own.__qualname__ += "_for_python"
         return _compiled(own, **self._options)
 
 
-def _type_of_inner(inner: _InnerKernel, _: object) -> Any:
-    return numba.typeof(inner._for_kernels)
-
-
-def _type_of_lazy(lazy: _LazyKernel, _: object) -> Any:
-    return numba.typeof(lazy._compiled)
-
-
-typeof_impl.register(_InnerKernel)(_type_of_inner)
-typeof_impl.register(_LazyKernel)(_type_of_lazy)
+typeof_impl.register(_InnerKernel)(lambda inner, _: numba.typeof(inner._for_kernels))
+typeof_impl.register(_LazyKernel)(lambda lazy, _: numba.typeof(lazy._compiled))
 
 
 def _inner(function: F, **options: object) -> F:

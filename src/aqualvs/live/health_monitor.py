@@ -23,7 +23,7 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import Instants
-from aqualvs.scanning.agreement import AgreementState, LaserAgreement
+from aqualvs.results.agreement import AgreementState, LaserAgreement
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import ImagePlane, Scan
 from aqualvs.sources.base import Health, PartHealth, StageDelay, State

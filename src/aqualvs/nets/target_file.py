@@ -38,7 +38,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 from aqualvs.schema import Positive, SchemaWords, StrictPart, validated
 from aqualvs.yamlfile import read_yaml
 

@@ -50,11 +50,6 @@ class BareParams(NamedTuple):
 
     centre: Vec  # The lens position L in `dome`, metres.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return ()
-
 
 @inline_kernel
 def _trace_bare(
@@ -97,45 +92,6 @@ OX, OY, OZ = ((N_LENS_ROWS + i_row) * BLOCK for i_row in range(3))
 N_RAY_ROWS = N_LENS_ROWS + 3
 
 
-@inline_kernel
-def trace_block(camera: CameraParams, w: FloatArray) -> None:
-    """Turn unit directions in `dome` into rays in the outer medium, all lanes of a block."""
-    for j in range(BLOCK):
-        passed, ox, oy, oz, dx, dy, dz = trace_port(camera.port, w[DX + j], w[DY + j], w[DZ + j])
-        w[OX + j], w[OY + j], w[OZ + j] = ox, oy, oz
-        w[DX + j], w[DY + j], w[DZ + j] = dx, dy, dz
-        w[LENS_OK + j] = w[LENS_OK + j] if passed else -1.0
-
-
-@inline_kernel
-def rotate_block(camera: CameraParams, w: FloatArray) -> None:
-    """Rotate directions from `cam` to `dome`, all lanes of a block."""
-    for j in range(BLOCK):
-        x, y, z = rotate_to_dome(camera, w[DX + j], w[DY + j], w[DZ + j])
-        w[DX + j], w[DY + j], w[DZ + j] = x, y, z
-
-
-@inline_kernel
-def store_rays(
-    start: int,
-    count: int,
-    w: FloatArray,
-    origins: FloatArray,
-    directions: FloatArray,
-    valid: BoolArray,
-) -> None:
-    """Write `count` rays from the scratch `w` to the rows from `start`."""
-    for j in range(count):
-        ok = w[LENS_OK + j] > 0.0
-        valid[start + j] = ok
-        origins[start + j, 0] = w[OX + j] if ok else np.nan
-        origins[start + j, 1] = w[OY + j] if ok else np.nan
-        origins[start + j, 2] = w[OZ + j] if ok else np.nan
-        directions[start + j, 0] = w[DX + j] if ok else np.nan
-        directions[start + j, 1] = w[DY + j] if ok else np.nan
-        directions[start + j, 2] = w[DZ + j] if ok else np.nan
-
-
 @kernel
 def rays_all(
     camera: CameraParams,
@@ -150,9 +106,23 @@ def rays_all(
         count = min(BLOCK, pixels.shape[0] - start)
         load_pixels(camera.lens, pixels, start, count, w)
         directions_block(camera.lens, count, w)
-        rotate_block(camera, w)
-        trace_block(camera, w)
-        store_rays(start, count, w, origins, directions, valid)
+        for j in range(BLOCK):
+            x, y, z = rotate_to_dome(camera, w[DX + j], w[DY + j], w[DZ + j])
+            w[DX + j], w[DY + j], w[DZ + j] = x, y, z
+        for j in range(BLOCK):
+            passed, ox, oy, oz, x, y, z = trace_port(camera.port, w[DX + j], w[DY + j], w[DZ + j])
+            w[OX + j], w[OY + j], w[OZ + j] = ox, oy, oz
+            w[DX + j], w[DY + j], w[DZ + j] = x, y, z
+            w[LENS_OK + j] = w[LENS_OK + j] if passed else -1.0
+        for j in range(count):
+            ok = w[LENS_OK + j] > 0.0
+            valid[start + j] = ok
+            origins[start + j, 0] = w[OX + j] if ok else np.nan
+            origins[start + j, 1] = w[OY + j] if ok else np.nan
+            origins[start + j, 2] = w[OZ + j] if ok else np.nan
+            directions[start + j, 0] = w[DX + j] if ok else np.nan
+            directions[start + j, 1] = w[DY + j] if ok else np.nan
+            directions[start + j, 2] = w[DZ + j] if ok else np.nan
 
 
 def parameter_names(camera: "Camera") -> tuple[str, ...]:
@@ -162,12 +132,8 @@ def parameter_names(camera: "Camera") -> tuple[str, ...]:
     then the intrinsics: fx, fy, cx, cy and as many distortion coefficients as the lens has, in
     OpenCV's order.
     """
-    return POSE_PARAMETERS + camera.params.port.names + camera.lens.parameter_names
-
-
-def _check_size(size_px: tuple[int, int]) -> None:
-    if len(size_px) != 2 or not all(side > 0 for side in size_px):
-        raise RigError(f"camera has size {size_px} px; width and height must be positive")
+    port = () if camera.housing is None else camera.housing.parameter_names
+    return POSE_PARAMETERS + port + camera.lens.parameter_names
 
 
 def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
@@ -211,7 +177,9 @@ class Camera:
     """Packed numbers for compiled kernels."""
 
     def __post_init__(self) -> None:
-        _check_size(self.size_px)
+        if len(self.size_px) != 2 or not all(side > 0 for side in self.size_px):
+            size = self.size_px
+            raise RigError(f"camera has size {size} px; width and height must be positive")
         check_index("camera", "n_air", self.n_air)
         check_index("camera", "n_water", self.n_water)
         rotation, centre = _checked_pose(self.dome_from_cam)
@@ -323,7 +291,7 @@ class Camera:
             valid.reshape(-1),
             by_point.reshape(-1, 2, 3),
             by_parameter,
-            len(POSE_PARAMETERS) + len(self.params.port.names),
+            len(parameter_names(self)) - len(self.lens.parameter_names),
         )
         return pixels, valid, by_point
 

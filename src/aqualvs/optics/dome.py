@@ -7,7 +7,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -37,11 +37,6 @@ class DomeParams(NamedTuple):
     decentring: float
     # L/|L| in `dome`; any unit vector when L is zero.
     axis: Vec
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return DOME_PARAMETERS
 
 
 @inline_kernel
@@ -83,6 +78,8 @@ class Dome:
     inner_radius: float  # In metres.
     thickness: float  # In metres; zero gives an infinitely thin dome.
     n_acrylic: float  # Refractive index of the dome's material, vacuum = 1.
+
+    parameter_names: ClassVar[tuple[str, ...]] = DOME_PARAMETERS
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.inner_radius) and self.inner_radius > 0.0):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig, RigUncertainty
@@ -163,15 +163,9 @@ def expected_posture_errors(
         Walls square to the forward axis, metres.
     """
     errors = PostureErrors(rig, rig.camera(), uncertainty)
-    walls = [WallView.ahead(rig, wall_range) for wall_range in ranges]
     return tuple(
-        ExpectedError(
-            wall_range=wall.wall_range,
-            per_pixel=wall.per_pixel,
-            noise=wall.noise(),
-            calibration=wall.calibration(errors),
-        )
-        for wall in walls
+        ExpectedError(wall.wall_range, wall.per_pixel, wall.noise(), wall.calibration(errors))
+        for wall in (WallView.ahead(rig, wall_range) for wall_range in ranges)
     )
 
 
@@ -189,9 +183,17 @@ class WallView:
 
     determined: bool = field(init=False)
     """Whether the stripes determine a plane."""
+    _points: FloatArray = field(init=False, repr=False, compare=False)
+    # Shape (N,): standard deviation of m·X from `SIGMA_PX`, for every point.
+    _sigma: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        points, _ = self._weighted(self._points())
+        seen = [stripe.points_in_dome for stripe in self.stripes if stripe.visible]
+        object.__setattr__(self, "_points", np.concatenate([np.empty((0, 3)), *seen]))
+        # With m = (0, 1/range, 0) an error of a point changes m·X by its y part over the range.
+        sigma = np.abs(np.concatenate([np.empty(0), *self.slopes])) * SIGMA_PX / self.wall_range
+        object.__setattr__(self, "_sigma", sigma)
+        points, _ = self._weighted(self._points)
         singular = np.linalg.svd(points, compute_uv=False)
         # Points on one line leave one direction of m·X = 1 to rounding.
         rounding = 1e-10
@@ -238,7 +240,7 @@ class WallView:
         """Return the covariance (3, 3) of range, pitch and yaw by `SIGMA_PX`; NaN where none."""
         if not self.determined:
             return np.full((3, 3), np.nan)
-        points, _ = self._weighted(self._points())
+        points, _ = self._weighted(self._points)
         by_m = self._by_m()
         return by_m @ np.linalg.inv(points.T @ points) @ by_m.T
 
@@ -254,7 +256,7 @@ class WallView:
         rows = np.concatenate([stripe.pixels[:, 1] for stripe in self.stripes if stripe.visible])
         # At its time t a point lies on the plane m + t * rate, so m is off by what explains
         # t * rate·X, of which the wall's rate is one column for each part of m.
-        points = self._points()
+        points = self._points
         moved, _ = self._weighted(points * row_times(rows)[:, None])
         by_rate = np.linalg.lstsq(self._weighted(points)[0], moved)[0]
         errors: FloatArray = self._by_m() @ by_rate @ np.linalg.inv(self._by_m())
@@ -272,30 +274,24 @@ class WallView:
         seen = [i for i, stripe in enumerate(self.stripes) if stripe.visible]
         pixels = np.concatenate([self.stripes[i].pixels for i in seen])
         laser = np.concatenate([np.full(len(self.stripes[i].pixels), i) for i in seen])
-        sigma, points = self._sigma(), self._points()
-        good = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(points).all(axis=-1)
+        sigma, points = self._sigma, self._points
+        good = self._good(points)
         wall = fitted_plane(np.array([0.0, 1.0 / self.wall_range, 0.0]), points[good])
         _, covariance = errors.propagate(
             wall, pixels[good], laser[good], points[good], sigma[good] ** -2.0, N_POINTS
         )
         return covariance
 
-    def _points(self) -> FloatArray:
-        seen = [stripe.points_in_dome for stripe in self.stripes if stripe.visible]
-        return np.concatenate([np.empty((0, 3)), *seen])
+    def _good(self, points: FloatArray) -> BoolArray:
+        """Return which points (N, 3) are known, and how far a pixel moves them."""
+        known: BoolArray = np.isfinite(self._sigma) & (self._sigma > 0.0)
+        return known & np.isfinite(points).all(axis=-1)
 
     def _weighted(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the points (N, 3) that are seen, times their weights (N,), and the weights."""
-        sigma = self._sigma()
-        good = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(points).all(axis=-1)
-        weights = 1.0 / sigma[good]
+        good = self._good(points)
+        weights = 1.0 / self._sigma[good]
         return points[good] * weights[:, None], weights
-
-    def _sigma(self) -> FloatArray:
-        """Return the standard deviation of m·X from `SIGMA_PX`, for every point (N,)."""
-        # With m = (0, 1/range, 0) an error of a point changes m·X by its y part over the range.
-        sigma: FloatArray = np.abs(np.concatenate([np.empty(0), *self.slopes]))
-        return sigma * SIGMA_PX / self.wall_range
 
 
 def _sigmas(covariance: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ medium; the way back is that of `aqualvs.optics.port_projection`.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -50,11 +50,6 @@ class FlatParams(NamedTuple):
     n_port: float
     n_water: float
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return FLAT_PARAMETERS
-
 
 @inline_kernel
 def trace_flat(
@@ -93,6 +88,8 @@ class FlatPort:
     # `tilt_y`, then about its x axis by `tilt_x`.
     tilt_x: float = 0.0
     tilt_y: float = 0.0
+
+    parameter_names: ClassVar[tuple[str, ...]] = FLAT_PARAMETERS
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.distance) and self.distance > 0.0):

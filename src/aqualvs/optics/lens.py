@@ -60,16 +60,6 @@ def directions_block(lens: LensParams, count: int, w: FloatArray) -> None:
             ok, w[DX + j], w[DY + j], w[DZ + j] = fisheye_direction(lens, w[XD + j], w[YD + j])
             w[LENS_OK + j] = 1.0 if ok else -1.0
         return
-    undistort_block(lens, count, w)
-    for j in range(BLOCK):
-        x, y = w[DX + j], w[DY + j]
-        z = 1.0 / math.sqrt(1.0 + x * x + y * y)
-        w[DX + j], w[DY + j], w[DZ + j] = x * z, y * z, z
-
-
-@inline_kernel
-def undistort_block(lens: LensParams, count: int, w: FloatArray) -> None:
-    """Turn distorted into normalised coordinates in DX, DY, all lanes of a block."""
     for j in range(BLOCK):
         xd, yd = w[XD + j], w[YD + j]
         w[DX + j], w[DY + j] = opencv_undistort_start(lens, xd, yd)
@@ -77,7 +67,7 @@ def undistort_block(lens: LensParams, count: int, w: FloatArray) -> None:
     n_open = count
     for _ in range(ROUNDS):
         if n_open == 0:
-            return
+            break
         for j in range(BLOCK):
             x, y, solved = opencv_undistort_round(lens, w[XD + j], w[YD + j], w[DX + j], w[DY + j])
             w[DX + j], w[DY + j] = x, y
@@ -89,6 +79,10 @@ def undistort_block(lens: LensParams, count: int, w: FloatArray) -> None:
         if w[LENS_OK + j] == 0.0:
             ok, w[DX + j], w[DY + j] = opencv_undistort_guarded(lens, w[XD + j], w[YD + j])
             w[LENS_OK + j] = 1.0 if ok else -1.0
+    for j in range(BLOCK):
+        x, y = w[DX + j], w[DY + j]
+        z = 1.0 / math.sqrt(1.0 + x * x + y * y)
+        w[DX + j], w[DY + j], w[DZ + j] = x * z, y * z, z
 
 
 @kernel
@@ -104,9 +98,8 @@ def directions_all(
         for j in range(count):
             ok = w[LENS_OK + j] > 0.0
             valid[start + j] = ok
-            directions[start + j, 0] = w[DX + j] if ok else np.nan
-            directions[start + j, 1] = w[DY + j] if ok else np.nan
-            directions[start + j, 2] = w[DZ + j] if ok else np.nan
+            for k in range(3):
+                directions[start + j, k] = w[DX + k * BLOCK + j] if ok else np.nan
 
 
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -157,8 +150,31 @@ class Lens:
     """Packed numbers for compiled kernels."""
 
     def __post_init__(self) -> None:
-        _check(self)
-        object.__setattr__(self, "params", _params(self))
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        if not np.all(np.isfinite((*intrinsics, *self.distortion))):
+            raise RigError(
+                f"lens has intrinsics {(*intrinsics, *self.distortion)}; every one must be a "
+                "finite number"
+            )
+        if not (self.fx > 0.0 and self.fy > 0.0):
+            raise RigError(
+                f"lens has focal lengths fx = {self.fx}, fy = {self.fy} px; both must be positive"
+            )
+        allowed = COEFFICIENT_COUNTS[LensModel(self.model)]
+        if len(self.distortion) not in allowed:
+            raise RigError(
+                f"lens has {len(self.distortion)} distortion coefficients; the {self.model} model "
+                f"takes {' or '.join(map(str, allowed))}"
+            )
+        fisheye = self.model is LensModel.FISHEYE
+        names = _FISHEYE_NAMES if fisheye else _OPENCV_NAMES
+        values = dict.fromkeys(_OPENCV_NAMES, 0.0)
+        values.update(zip(names, map(float, self.distortion), strict=False))
+        numbers = [*map(float, intrinsics), *values.values(), 0.0, 0.0]
+        params = LensParams._make([fisheye, *numbers])
+        limit, limit_distorted = fisheye_limits(params) if fisheye else opencv_limits(params)
+        params = params._replace(limit=limit, limit_distorted=limit_distorted)
+        object.__setattr__(self, "params", params)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -203,7 +219,7 @@ class Lens:
         Newton's method on the exact Jacobian, to machine precision.
         """
         p = as_vectors(pixels, 2, "pixels")
-        directions, valid = _empty(p, 3), np.empty(p.shape[:-1], dtype=np.bool_)
+        directions, valid = np.empty((*p.shape[:-1], 3)), np.empty(p.shape[:-1], dtype=np.bool_)
         directions_all(self.params, p.reshape(-1, 2), directions.reshape(-1, 3), valid.reshape(-1))
         return directions, valid
 
@@ -223,91 +239,8 @@ class Lens:
             False outside the monotone region, and behind the camera for `opencv`.
         """
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
-        pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
+        pixels, valid = np.empty((*d.shape[:-1], 2)), np.empty(d.shape[:-1], dtype=np.bool_)
         from aqualvs.optics.projection import pixels_all
 
         pixels_all(self.params, d.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
-
-    def pixels_with_jacobian(
-        self, directions_in_cam: ArrayLike
-    ) -> tuple[FloatArray, BoolArray, FloatArray]:
-        """Return `pixels` and their derivatives by the direction as given, shape (..., 2, 3)."""
-        d = as_vectors(directions_in_cam, 3, "directions_in_cam")
-        pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
-        jacobian = _empty(d, 2, 3)
-        from aqualvs.optics.projection import pixels_jacobian_all
-
-        pixels_jacobian_all(
-            self.params,
-            d.reshape(-1, 3),
-            pixels.reshape(-1, 2),
-            valid.reshape(-1),
-            jacobian.reshape(-1, 2, 3),
-        )
-        return pixels, valid, jacobian
-
-    def pixels_with_parameter_jacobian(
-        self, directions_in_cam: ArrayLike
-    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-        """Return `pixels_with_jacobian` and the derivatives by the intrinsics.
-
-        Returns
-        -------
-        pixels, valid, direction_jacobian
-            As `pixels_with_jacobian` gives them.
-        parameter_jacobian : array, shape (..., 2, P)
-            Columns in the order of `parameter_names`; NaN where not valid.
-        """
-        d = as_vectors(directions_in_cam, 3, "directions_in_cam")
-        pixels, valid, jacobian = self.pixels_with_jacobian(d)
-        n_parameters = 4 + len(self.distortion)
-        by_parameter = _empty(d, 2, n_parameters)
-        from aqualvs.optics.projection import intrinsics_jacobian_all
-
-        intrinsics_jacobian_all(
-            self.params,
-            d.reshape(-1, 3),
-            valid.reshape(-1),
-            by_parameter.reshape(-1, 2, n_parameters),
-        )
-        return pixels, valid, jacobian, by_parameter
-
-
-def _empty(like: FloatArray, *shape: int) -> FloatArray:
-    return np.empty((*like.shape[:-1], *shape))
-
-
-def _check(lens: Lens) -> None:
-    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    if not np.all(np.isfinite(values)):
-        raise RigError(f"lens has intrinsics {values}; every one must be a finite number")
-    if not (lens.fx > 0.0 and lens.fy > 0.0):
-        raise RigError(
-            f"lens has focal lengths fx = {lens.fx}, fy = {lens.fy} px; both must be positive"
-        )
-    allowed = COEFFICIENT_COUNTS[LensModel(lens.model)]
-    if len(lens.distortion) not in allowed:
-        raise RigError(
-            f"lens has {len(lens.distortion)} distortion coefficients; the {lens.model} model "
-            f"takes {' or '.join(map(str, allowed))}"
-        )
-
-
-def _params(lens: Lens) -> LensParams:
-    fisheye = lens.model is LensModel.FISHEYE
-    names = _FISHEYE_NAMES if fisheye else _OPENCV_NAMES
-    values = dict.fromkeys(_OPENCV_NAMES, 0.0)
-    values.update(zip(names, map(float, lens.distortion), strict=False))
-    params = LensParams(
-        fisheye=fisheye,
-        fx=float(lens.fx),
-        fy=float(lens.fy),
-        cx=float(lens.cx),
-        cy=float(lens.cy),
-        limit=0.0,
-        limit_distorted=0.0,
-        **values,
-    )
-    limit, limit_distorted = fisheye_limits(params) if fisheye else opencv_limits(params)
-    return params._replace(limit=limit, limit_distorted=limit_distorted)

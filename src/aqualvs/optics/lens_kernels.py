@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, python_of
 
 
@@ -252,7 +251,13 @@ def _limits_of_distortion(lens: LensParams) -> tuple[float, float]:
     radii, spokes = _TANGENTS, _SPOKES
     # Each search divides the step that holds the limit; the last one, between neighbouring numbers.
     while True:
-        monotone = _is_monotone(lens, spokes[:, :, None] * radii[1:])
+        # Beyond the limit the model may have poles.
+        with np.errstate(all="ignore"):
+            points = spokes[:, :, None] * radii[1:]
+            _, _, j_xx, j_xy, j_yy = python_of(opencv_distort)(lens, *points)
+            # Where the Jacobian is positive definite: beyond two sign changes the determinant is
+            # positive again, the trace is not.
+            monotone = (j_xx * j_yy - j_xy * j_xy > 0.0) & (j_xx + j_yy > 0.0)
         if monotone.all():
             return math.inf, math.inf
         first = int(np.argmin(monotone.all(axis=0)))
@@ -264,16 +269,6 @@ def _limits_of_distortion(lens: LensParams) -> tuple[float, float]:
     # The distorted radius between two spokes may exceed that on both, by tangential terms.
     between_spokes = 1.02
     return inside * inside, between_spokes * float((xd * xd + yd * yd).max())
-
-
-def _is_monotone(lens: LensParams, points: FloatArray) -> BoolArray:
-    """Return where the Jacobian is positive definite at points (2, ...)."""
-    # Beyond the limit the model may have poles.
-    with np.errstate(all="ignore"):
-        _, _, j_xx, j_xy, j_yy = python_of(opencv_distort)(lens, *points)
-        # Beyond two sign changes the determinant is positive again, the trace is not.
-        monotone: BoolArray = (j_xx * j_yy - j_xy * j_xy > 0.0) & (j_xx + j_yy > 0.0)
-    return monotone
 
 
 @inline_kernel

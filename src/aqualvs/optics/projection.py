@@ -61,18 +61,10 @@ def fisheye_pixel(lens: LensParams, x: float, y: float, z: float) -> tuple[bool,
 
 
 @inline_kernel
-def lens_pixel(lens: LensParams, x: float, y: float, z: float) -> tuple[bool, float, float]:
-    """Return (valid, u, v): where the direction (x, y, z) in `cam`, of any length, is seen."""
-    if lens.fisheye:
-        return fisheye_pixel(lens, x, y, z)
-    return opencv_pixel(lens, x, y, z)
-
-
-@inline_kernel
 def opencv_pixel_jacobian(
     lens: LensParams, x: float, y: float, z: float
 ) -> tuple[bool, float, float, Vec, Vec]:
-    """Return `lens_pixel_jacobian` of the opencv model, without branches."""
+    """Return (valid, u, v, gradient of u, gradient of v) of a direction, without branches."""
     inverse = 1.0 / z
     xn, yn = x * inverse, y * inverse
     xd, yd, j_xx, j_xy, j_yy = opencv_distort(lens, xn, yn)
@@ -90,7 +82,7 @@ def opencv_pixel_jacobian(
 def fisheye_pixel_jacobian(
     lens: LensParams, x: float, y: float, z: float
 ) -> tuple[bool, float, float, Vec, Vec]:
-    """Return `lens_pixel_jacobian` of the fisheye model."""
+    """Return (valid, u, v, gradient of u, gradient of v) of a direction."""
     radius = math.sqrt(x * x + y * y)
     theta = math.atan2(radius, z)
     value, slope = fisheye_distort(lens, theta)
@@ -112,65 +104,22 @@ def fisheye_pixel_jacobian(
     )
 
 
-@inline_kernel
-def lens_pixel_jacobian(
-    lens: LensParams, x: float, y: float, z: float
-) -> tuple[bool, float, float, Vec, Vec]:
-    """Return (valid, u, v, gradient of u, gradient of v) with respect to the direction."""
-    if lens.fisheye:
-        return fisheye_pixel_jacobian(lens, x, y, z)
-    return opencv_pixel_jacobian(lens, x, y, z)
-
-
 @kernel
 def pixels_all(
     lens: LensParams, directions: FloatArray, pixels: FloatArray, valid: BoolArray
 ) -> None:
     """Write pixels (N, 2) of directions (N, 3)."""
     for i in range(directions.shape[0]):
-        ok, u, v = lens_pixel(lens, directions[i, 0], directions[i, 1], directions[i, 2])
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        ok, u, v = fisheye_pixel(lens, x, y, z) if lens.fisheye else opencv_pixel(lens, x, y, z)
         valid[i] = ok
         pixels[i, 0] = u if ok else np.nan
         pixels[i, 1] = v if ok else np.nan
-
-
-@kernel
-def pixels_jacobian_all(
-    lens: LensParams,
-    directions: FloatArray,
-    pixels: FloatArray,
-    valid: BoolArray,
-    jacobian: FloatArray,
-) -> None:
-    """Write pixels (N, 2) of directions (N, 3) with their Jacobians (N, 2, 3)."""
-    for i in range(directions.shape[0]):
-        ok, u, v, u_d, v_d = lens_pixel_jacobian(
-            lens, directions[i, 0], directions[i, 1], directions[i, 2]
-        )
-        valid[i] = ok
-        pixels[i, 0] = u if ok else np.nan
-        pixels[i, 1] = v if ok else np.nan
-        for k in range(3):
-            jacobian[i, 0, k] = u_d[k] if ok else np.nan
-            jacobian[i, 1, k] = v_d[k] if ok else np.nan
-
-
-@inline_kernel
-def write_intrinsics_jacobian(
-    lens: LensParams, x: float, y: float, z: float, jacobian: FloatArray
-) -> None:
-    """Write d(u, v) / d(fx, fy, cx, cy, distortion...) of one direction into (2, 4 + n)."""
-    jacobian[:] = 0.0
-    if lens.fisheye:
-        _write_fisheye(lens, x, y, z, jacobian)
-    else:
-        _write_opencv(lens, x / z, y / z, jacobian)
-    jacobian[0, 2] = 1.0
-    jacobian[1, 3] = 1.0
 
 
 @inline_kernel
 def _write_opencv(lens: LensParams, x: float, y: float, jacobian: FloatArray) -> None:
+    """Write d(u, v) / d(fx, fy, cx, cy, distortion...) of (x, y, 1) into (2, 4 + n)."""
     q = x * x + y * y
     inverse = 1.0 / (1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6)))
     f = (1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))) * inverse
@@ -208,20 +157,6 @@ def _write_fisheye(lens: LensParams, x: float, y: float, z: float, jacobian: Flo
         jacobian[1, 4 + k] = lens.fy * power * ey
 
 
-@kernel
-def intrinsics_jacobian_all(
-    lens: LensParams, directions: FloatArray, valid: BoolArray, jacobian: FloatArray
-) -> None:
-    """Write derivatives (N, 2, 4 + n) of pixels by fx, fy, cx, cy and n distortion coefficients."""
-    for i in range(directions.shape[0]):
-        if valid[i]:
-            write_intrinsics_jacobian(
-                lens, directions[i, 0], directions[i, 1], directions[i, 2], jacobian[i]
-            )
-        else:
-            jacobian[i] = np.nan
-
-
 # Rows of the scratch array: the point, which becomes the direction at the lens, then the pixel;
 # its polar coordinates (distance inverted), or, of a flat port, its height above the outer face
 # and its distance from the axis; the unit vector across the axis; the solution; a sign, positive
@@ -240,29 +175,22 @@ def bare_directions_block(port: BareParams, _count: int, w: FloatArray) -> None:
 
 
 @inline_kernel
-def polar_block(port: DomeParams, w: FloatArray) -> None:
-    """Turn points into polar coordinates and the start of the search, all lanes of a block."""
+def dome_directions_block(port: DomeParams, count: int, w: FloatArray) -> None:
+    """Turn points into directions at the lens, in `dome`, all lanes of a block.
+
+    Lanes that no round of steps solves are searched one by one.
+    """
     n_l = port.n_air * port.decentring
     for j in range(BLOCK):
         far, cos_t, sin_t, e = polar_angle(port, w[PX + j], w[PY + j], w[PZ + j])
         w[FAR + j], w[COS_T + j], w[SIN_T + j] = far, cos_t, sin_t
         w[EX + j], w[EY + j], w[EZ + j] = e
         w[OK + j] = 0.0 if is_outside(port, far) else -1.0
-        s = angle_sines(port, far)
-        w[COS_A + j], w[SIN_A + j] = newton_start(s, n_l, cos_t, sin_t)
-
-
-@inline_kernel
-def solve_block(port: DomeParams, count: int, w: FloatArray) -> None:
-    """Solve for the ray's angle at the lens, all lanes of a block; set the signs of validity.
-
-    Lanes that no round of steps solves are searched one by one.
-    """
-    n_l = port.n_air * port.decentring
+        w[COS_A + j], w[SIN_A + j] = newton_start(angle_sines(port, far), n_l, cos_t, sin_t)
     n_open = count
     for _ in range(ROUNDS):
         if n_open == 0:
-            return
+            break
         for j in range(BLOCK):
             s = angle_sines(port, w[FAR + j])
             c, k, solved = three_newton_steps(
@@ -278,25 +206,12 @@ def solve_block(port: DomeParams, count: int, w: FloatArray) -> None:
             s = angle_sines(port, w[FAR + j])
             found, w[COS_A + j], w[SIN_A + j] = bisect_dome(s, n_l, w[COS_T + j], w[SIN_T + j])
             w[OK + j] = 1.0 if found else -1.0
-
-
-@inline_kernel
-def angles_to_directions_block(port: DomeParams, w: FloatArray) -> None:
-    """Turn solved angles into directions at the lens, in `dome`, all lanes of a block."""
     ax, ay, az = port.axis
     for j in range(BLOCK):
         c, k = w[COS_A + j], w[SIN_A + j]
         w[PX + j] = c * ax + k * w[EX + j]
         w[PY + j] = c * ay + k * w[EY + j]
         w[PZ + j] = c * az + k * w[EZ + j]
-
-
-@inline_kernel
-def dome_directions_block(port: DomeParams, count: int, w: FloatArray) -> None:
-    """Turn points into directions at the lens, in `dome`, all lanes of a block."""
-    polar_block(port, w)
-    solve_block(port, count, w)
-    angles_to_directions_block(port, w)
 
 
 @inline_kernel
@@ -497,24 +412,6 @@ def load_points(points: FloatArray, start: int, count: int, w: FloatArray) -> No
         w[PZ + j] = points[start + j, 2]
 
 
-@inline_kernel
-def pixels_block(camera: CameraParams, count: int, w: FloatArray) -> None:
-    """Turn directions in `dome` into pixels, all lanes of a block."""
-    for j in range(BLOCK):
-        x, y, z = rotate_to_cam(camera, w[PX + j], w[PY + j], w[PZ + j])
-        w[PX + j], w[PY + j], w[PZ + j] = x, y, z
-    if camera.lens.fisheye:
-        for j in range(count):
-            seen, u, v = fisheye_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
-            w[PX + j], w[PY + j] = u, v
-            w[OK + j] = w[OK + j] if seen else -1.0
-        return
-    for j in range(BLOCK):
-        seen, u, v = opencv_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
-        w[PX + j], w[PY + j] = u, v
-        w[OK + j] = w[OK + j] if seen else -1.0
-
-
 @kernel
 def project_all(
     camera: CameraParams, points: FloatArray, pixels: FloatArray, valid: BoolArray
@@ -525,7 +422,19 @@ def project_all(
         count = min(BLOCK, points.shape[0] - start)
         load_points(points, start, count, w)
         port_directions_block(camera.port, count, w)
-        pixels_block(camera, count, w)
+        for j in range(BLOCK):
+            x, y, z = rotate_to_cam(camera, w[PX + j], w[PY + j], w[PZ + j])
+            w[PX + j], w[PY + j], w[PZ + j] = x, y, z
+        if camera.lens.fisheye:
+            for j in range(count):
+                seen, u, v = fisheye_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+                w[PX + j], w[PY + j] = u, v
+                w[OK + j] = w[OK + j] if seen else -1.0
+        else:
+            for j in range(BLOCK):
+                seen, u, v = opencv_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+                w[PX + j], w[PY + j] = u, v
+                w[OK + j] = w[OK + j] if seen else -1.0
         for j in range(count):
             ok = w[OK + j] > 0.0
             valid[start + j] = ok
@@ -570,9 +479,13 @@ def store_parameters(
         if w[OK + j] < 0.0:
             jacobian[start + j] = np.nan
             continue
-        write_intrinsics_jacobian(
-            camera.lens, w[CX + j], w[CY + j], w[CZ + j], jacobian[start + j, :, n_before:]
-        )
+        by_lens, x, y, z = jacobian[start + j, :, n_before:], w[CX + j], w[CY + j], w[CZ + j]
+        by_lens[:] = 0.0
+        if camera.lens.fisheye:
+            _write_fisheye(camera.lens, x, y, z, by_lens)
+        else:
+            _write_opencv(camera.lens, x / z, y / z, by_lens)
+        by_lens[0, 2] = by_lens[1, 3] = 1.0
         for k in range(n_before):
             jacobian[start + j, 0, k] = w[JU + (3 + k) * BLOCK + j]
             jacobian[start + j, 1, k] = w[JV + (3 + k) * BLOCK + j]

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import inline_kernel
 from aqualvs.geometry.linear_algebra import Vec
 
 
@@ -103,26 +103,6 @@ def leave_plane(p: Vec, d: Vec, normal: Vec, height: float, ratio: float) -> tup
     )
 
 
-@kernel
-def _refract_all(
-    directions: FloatArray,
-    normals: FloatArray,
-    ratio: float,
-    refracted: FloatArray,
-    valid: BoolArray,
-) -> None:
-    for i in range(directions.shape[0]):
-        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-        cos_in = -(dx * nx + dy * ny + dz * nz)
-        k, radicand = snell_weight(cos_in, ratio)
-        ok = radicand >= 0.0 and cos_in >= 0.0
-        valid[i] = ok
-        refracted[i, 0] = ratio * dx + k * nx if ok else np.nan
-        refracted[i, 1] = ratio * dy + k * ny if ok else np.nan
-        refracted[i, 2] = ratio * dz + k * nz if ok else np.nan
-
-
 def refract(
     directions: ArrayLike, normals: ArrayLike, *, n_in: float, n_out: float
 ) -> tuple[FloatArray, BoolArray]:
@@ -158,13 +138,10 @@ def refract(
     d, n = np.broadcast_arrays(
         as_vectors(directions, 3, "directions"), as_vectors(normals, 3, "normals")
     )
-    refracted = np.empty(d.shape)
-    valid = np.empty(d.shape[:-1], dtype=np.bool_)
-    _refract_all(
-        np.ascontiguousarray(d).reshape(-1, 3),
-        np.ascontiguousarray(n).reshape(-1, 3),
-        n_in / n_out,
-        refracted.reshape(-1, 3),
-        valid.reshape(-1),
-    )
+    ratio = n_in / n_out
+    cos_in = -(d[..., 0] * n[..., 0] + d[..., 1] * n[..., 1] + d[..., 2] * n[..., 2])
+    radicand = 1.0 - ratio * ratio * (1.0 - cos_in * cos_in)
+    k = ratio * cos_in - np.sqrt(np.maximum(radicand, 0.0))
+    valid: BoolArray = np.asarray((radicand >= 0.0) & (cos_in >= 0.0))
+    refracted = np.where(valid[..., None], ratio * d + k[..., None] * n, np.nan)
     return refracted, valid

@@ -111,8 +111,6 @@ class PostureErrors:
     ----------
     names : tuple of str
         Numbers of the rig that have an uncertainty, P of them.
-    covariance : array, shape (P, P)
-        Theirs.
     """
 
     def __init__(self, rig: Rig, camera: Camera, uncertainty: RigUncertainty) -> None:
@@ -120,7 +118,6 @@ class PostureErrors:
         step_share, largest_step = 0.1, 1e-4
         sigmas = uncertainty.sigmas
         self.names = tuple(name for name in uncertainty.names if sigmas[name] > 0.0)
-        self.covariance = uncertainty.of(self.names)
         steps = {name: min(step_share * sigmas[name], largest_step) for name in self.names}
         self._n_lasers = len(rig.lasers)
         own = parameter_names(camera)
@@ -130,7 +127,7 @@ class PostureErrors:
             _derivatives_on_lattice(replace(rig, housing=camera.housing), camera_steps),
             _sheet_moves(rig, camera, steps),
             np.array(camera_columns, np.int64),
-            self.covariance,
+            uncertainty.of(self.names),
         )
 
     def propagate(
@@ -196,20 +193,16 @@ def _derivatives_on_lattice(rig: Rig, steps: dict[str, float]) -> _Lattice:
         by_direction = (ahead.directions - behind.directions) / (2.0 * h)
         rows.append(np.concatenate([by_origin, by_direction], axis=-1))
     table = np.stack(rows, axis=1)
-    _fill_blind(table, pixels)
-    scale = np.array([(n_x - 1) / (width - 1), (n_y - 1) / (height - 1)])
-    return _Lattice(np.ascontiguousarray(table.reshape(n_y, n_x, -1, 6)), scale)
-
-
-def _fill_blind(table: FloatArray, pixels: FloatArray) -> None:
-    """Give nodes without a ray the values of the nearest one that has a ray."""
     seen = np.isfinite(table).all(axis=(1, 2))
     if not seen.any():
         table[:] = 0.0
-        return
-    for i in np.flatnonzero(~seen):
-        nearest = np.argmin(np.sum((pixels[seen] - pixels[i]) ** 2, axis=-1))
-        table[i] = table[np.flatnonzero(seen)[nearest]]
+    else:
+        # Nodes without a ray get the values of the nearest one that has a ray.
+        for i in np.flatnonzero(~seen):
+            nearest = np.argmin(np.sum((pixels[seen] - pixels[i]) ** 2, axis=-1))
+            table[i] = table[np.flatnonzero(seen)[nearest]]
+    scale = np.array([(n_x - 1) / (width - 1), (n_y - 1) / (height - 1)])
+    return _Lattice(np.ascontiguousarray(table.reshape(n_y, n_x, -1, 6)), scale)
 
 
 def _sheet_moves(rig: Rig, camera: Camera, steps: dict[str, float]) -> _SheetMoves:

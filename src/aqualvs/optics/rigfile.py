@@ -6,6 +6,7 @@ is kept under its date in UTC, such as `rig.2026-11-23T141503.yaml` (`keep_dated
 explains every key.
 """
 
+import contextlib
 import math
 import os
 import re
@@ -52,27 +53,29 @@ def keep_dated(path: Path, now: datetime | None = None) -> Path:
     copied.
     """
     stamp = (now or datetime.now(UTC)).astimezone(UTC).strftime("%Y-%m-%dT%H%M%S")
-    number = 1
-    while True:
-        again = f"-{number}" if number > 1 else ""
-        copy = path.with_name(f"{path.stem}.{stamp}{again}{path.suffix}")
-        number += 1
-        try:
-            content = path.read_bytes()
-            file = copy.open("xb")
-        except FileExistsError:
-            continue
-        except OSError as fault:
-            raise _uncopied(path, fault) from fault
+    number, file = 1, None
+    try:
+        content = path.read_bytes()
+        while file is None:
+            again = f"-{number}" if number > 1 else ""
+            copy = path.with_name(f"{path.stem}.{stamp}{again}{path.suffix}")
+            number += 1
+            with contextlib.suppress(FileExistsError):
+                file = copy.open("xb")
         try:
             with file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-        except OSError as fault:
+        except OSError:
             copy.unlink(missing_ok=True)
-            raise _uncopied(path, fault) from fault
-        return copy
+            raise
+    except OSError as fault:
+        raise OutputError(
+            f"{path}: cannot be kept as a dated copy ({fault.strerror}), so it is not replaced; "
+            "free the disk or choose another place"
+        ) from fault
+    return copy
 
 
 def dated_copies(path: Path) -> list[Path]:
@@ -84,13 +87,6 @@ def dated_copies(path: Path) -> list[Path]:
         if stamp is not None and copy.name == f"{path.stem}{middle}{path.suffix}":
             found.append((stamp[1], int(stamp[2] or 1), copy))
     return [copy for _, _, copy in sorted(found, reverse=True)]
-
-
-def _uncopied(path: Path, fault: OSError) -> OutputError:
-    return OutputError(
-        f"{path}: cannot be kept as a dated copy ({fault.strerror}), so it is not replaced; free "
-        "the disk or choose another place"
-    )
 
 
 _MILLI = 1e3
@@ -506,20 +502,17 @@ def _camera_mapping(rig: Rig) -> dict[str, Any]:
         # Adding zero turns -0.0 into 0.0.
         "rotation_deg": [round(float(value), _ROTATION_DECIMALS) + 0.0 for value in turn],
     }
-    if rig.shutter != AT_ONCE:
-        content["shutter"] = _shutter_mapping(rig.shutter)
-    return content
-
-
-def _shutter_mapping(shutter: Shutter) -> dict[str, Any]:
-    """Return the keys of a shutter, without those that say nothing about its kind."""
-    content: dict[str, Any] = {"kind": shutter.kind.value}
-    if shutter.readout != 0.0:
-        content["readout_ms"] = _to_milli(shutter.readout)
-    if shutter.exposure > 0.0:
-        content["exposure_ms"] = _to_milli(shutter.exposure)
-    if shutter.is_interlaced:
-        content["first_field"] = shutter.first_field
+    shutter = rig.shutter
+    if shutter != AT_ONCE:
+        # Without those keys that say nothing about its kind.
+        keys: dict[str, Any] = {"kind": shutter.kind.value}
+        content["shutter"] = keys
+        if shutter.readout != 0.0:
+            keys["readout_ms"] = _to_milli(shutter.readout)
+        if shutter.exposure > 0.0:
+            keys["exposure_ms"] = _to_milli(shutter.exposure)
+        if shutter.is_interlaced:
+            keys["first_field"] = shutter.first_field
     return content
 
 

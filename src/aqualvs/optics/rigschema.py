@@ -147,9 +147,8 @@ class WaterPart(StrictPart):
                 {
                     "required": ["n"],
                     "properties": {
-                        "temperature_c": {"type": "null"},
-                        "salinity_permille": {"type": "null"},
-                        "wavelength_nm": {"type": "null"},
+                        name: {"type": "null"}
+                        for name in ("temperature_c", "salinity_permille", "wavelength_nm")
                     },
                 },
                 {
@@ -292,11 +291,6 @@ def parse_rig(content: object, source_name: str) -> RigFile:
             f"{source_name}: is {shown(content)}, not a rig; a rig file is a list of keys that "
             f"begins with 'aqualvs_rig: {VERSION}' (docs/rig.md)"
         )
-    _check_version(content, source_name)
-    return validated(RigFile, dict(content), source_name, RigError, _WORDS)
-
-
-def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
     if "aqualvs_rig" not in content:
         raise RigError(
             f"{source_name}: aqualvs_rig is missing, so this may not be a rig file; a rig file "
@@ -308,6 +302,7 @@ def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
             f"{source_name}: aqualvs_rig is {shown(version)}, but this aqualvs reads version "
             f"{VERSION}; write the file again with this aqualvs, or install one that reads it"
         )
+    return validated(RigFile, dict(content), source_name, RigError, _WORDS)
 
 
 _EXAMPLES: dict[str, str] = {

@@ -211,15 +211,6 @@ def distances(row: FloatArray, points: FloatArray, out: FloatArray) -> None:
 
 
 @borrowing_kernel
-def tangents(row: FloatArray, points: FloatArray, out: FloatArray) -> None:
-    """Write f and its gradient, shape (N, 4), of points (N, 3)."""
-    for i in range(points.shape[0]):
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = sheet_tangent(
-            row, points[i, 0], points[i, 1], points[i, 2]
-        )
-
-
-@borrowing_kernel
 def differentials(row: FloatArray, points: FloatArray, out: FloatArray) -> None:
     """Write what `differential` returns, shape (N, 12), for points (N, 3)."""
     for i in range(points.shape[0]):
@@ -273,6 +264,9 @@ class Sheet:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_row", self._pack())
+        if self.window is not None:
+            start = self._plane_beyond()
+            self._row[START : START + 3], self._row[START + 3] = start.normal, start.offset
 
     @property
     def is_plane(self) -> bool:
@@ -317,15 +311,17 @@ class Sheet:
 
     def gradient(self, points: ArrayLike) -> FloatArray:
         """Return the gradient (..., 3) of `signed_distance` at points (..., 3)."""
-        return self._tangents(as_vectors(points, 3, "points"))[..., 1:]
+        p = as_vectors(points, 3, "points")
+        return self._by_point(self._differentials(p.reshape(-1, 3))).reshape(p.shape)
 
     def tangent_plane(self, point: ArrayLike) -> Plane:
         """Return the plane that touches the sheet beside a point (3,) near it."""
         p = as_vectors(point, 3, "point")
         if self.window is None:
             return self.plane
-        f, *gradient = self._tangents(p)
-        return Plane.from_normal(gradient, float(np.dot(gradient, p) - f))
+        parts = self._differentials(p[None])
+        gradient = self._by_point(parts)[0]
+        return Plane.from_normal(gradient, float(gradient @ p - parts[0, 0]))
 
     def intersect(self, rays: Rays) -> tuple[FloatArray, BoolArray]:
         """Intersect rays with the sheet, as `Plane.intersect` does with a plane.
@@ -371,7 +367,14 @@ class Sheet:
         points = points[valid]
         distance = np.linalg.norm(points, axis=-1)
         near, far = working_range
-        return self._fitted(points[(distance >= near) & (distance <= far)])
+        points = points[(distance >= near) & (distance <= far)]
+        start = Plane(self._row[START : START + 3].copy(), float(self._row[START + 3]))
+        if len(points) < 3:
+            return start
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
+        normal = normal if normal @ start.normal > 0.0 else -normal
+        return Plane.from_normal(normal, float(normal @ middle))
 
     def shine(self, directions: ArrayLike) -> tuple[Rays, FloatArray]:
         """Trace light from the source through the window.
@@ -422,11 +425,7 @@ class Sheet:
         f, (by_v, by_slant, by_height, by_h, by_s, by_rho, by_k) = parts[:, 0], parts[:, 1:8].T
         height, beside = parts[:, 8], parts[:, 9:]
         normal, face, slant = self._row[NORMAL:OFFSET], self._row[FACE:SOURCE], self._row[SLANT]
-        by_point = (
-            by_v[:, None] * normal
-            + (by_height + by_h)[:, None] * face
-            + 2 * by_rho[:, None] * beside
-        )
+        by_point = self._by_point(parts)
         # The source stays in the plane: as the plane moves along its normal, so does the source.
         by_source_along_normal = -slant * (by_height + by_s) - 2.0 * by_rho * (beside @ normal)
         columns = []
@@ -490,10 +489,13 @@ class Sheet:
             row[START : START + 3], row[START + 3] = start.normal, start.offset
         return row
 
-    def _tangents(self, points: FloatArray) -> FloatArray:
-        found = np.empty((*points.shape[:-1], 4))
-        tangents(self._row, points.reshape(-1, 3), found.reshape(-1, 4))
-        return found
+    def _by_point(self, parts: FloatArray) -> FloatArray:
+        """Return the gradients (N, 3) of f, from `_differentials`."""
+        by_v, _, by_height, by_h, _, by_rho = parts[:, 1:7].T
+        normal, face = self._row[NORMAL:OFFSET], self._row[FACE:SOURCE]
+        by_point: FloatArray = by_v[:, None] * normal + (by_height + by_h)[:, None] * face
+        by_point += 2.0 * by_rho[:, None] * parts[:, 9:]
+        return by_point
 
     def _toward_water(self, window: Window) -> float:
         """1 if the face's normal points away from the source, else -1."""
@@ -513,33 +515,21 @@ class Sheet:
         row[DEPTH] = abs(float(self.window.face.signed_distance(source)))
         row[RATIO], row[SLANT] = self.n_air / self.n_water, float(self.plane.normal @ face)
         row[WINDOWED] = 1.0
-        start = self._plane_beyond(row, source, face)
-        row[START : START + 3], row[START + 3] = start.normal, start.offset
         return row
 
-    def _plane_beyond(self, row: FloatArray, source: FloatArray, face: FloatArray) -> Plane:
+    def _plane_beyond(self) -> Plane:
         """Return the tangent plane `_USUAL_REACH` along the light squarest to the window."""
-        inward = face - row[SLANT] * self.plane.normal
+        face, depth = self._row[FACE:SOURCE], self._row[DEPTH]
+        inward = face - self._row[SLANT] * self.plane.normal
         length = float(np.linalg.norm(inward))
         if length < 1e-6:
             return self.plane
         inward /= length
         bent, _ = refract(inward, -face, n_in=self.n_air, n_out=self.n_water)
-        at = source + row[DEPTH] / float(inward @ face) * inward + _USUAL_REACH * bent
-        tangent = np.empty((1, 4))
-        tangents(row, at[None], tangent)
-        gradient = tangent[0, 1:]
-        return Plane.from_normal(gradient, float(gradient @ at - tangent[0, 0]))
-
-    def _fitted(self, points: FloatArray) -> Plane:
-        """Return the least-squares plane of points on the sheet; the tangent plane if too few."""
-        start = Plane(self._row[START : START + 3].copy(), float(self._row[START + 3]))
-        if len(points) < 3:
-            return start
-        middle = points.mean(axis=0)
-        normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
-        normal = normal if normal @ start.normal > 0.0 else -normal
-        return Plane.from_normal(normal, float(normal @ middle))
+        source = self._row[SOURCE:DEPTH]
+        return self.tangent_plane(
+            source + depth / float(inward @ face) * inward + _USUAL_REACH * bent
+        )
 
 
 def sheet_in(laser: Laser, n_air: float, n_water: float) -> Sheet:

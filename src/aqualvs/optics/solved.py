@@ -50,18 +50,14 @@ EXACT = "exact"
 _UNCERTAINTY = "uncertainty"
 _PLACE = f"solved_from.{_UNCERTAINTY}"
 _KEYS = ("parameters", "sigma", "correlation")
-_DEG = 180.0 / math.pi
-_MM = (
-    *("lens_x", "lens_y", "lens_z", "inner_radius", "thickness", "port_distance"),
-    *("offset", "window_offset"),
-)
-_UNIT_OF = {
-    **dict.fromkeys((*_MM, "source_1", "source_2"), ("mm", 1e3)),
-    **dict.fromkeys(("rotation_x", "rotation_y", "rotation_z"), ("deg", _DEG)),
-    **dict.fromkeys(("port_tilt_x", "port_tilt_y"), ("deg", _DEG)),
-    **dict.fromkeys(("tilt_1", "tilt_2", "window_tilt_1", "window_tilt_2"), ("deg", _DEG)),
-    **dict.fromkeys(("fx", "fy", "cx", "cy"), ("px", 1.0)),
+_UNITS = {
+    ("mm", 1e3): "lens_x lens_y lens_z inner_radius thickness port_distance offset window_offset "
+    "source_1 source_2",
+    ("deg", 180.0 / math.pi): "rotation_x rotation_y rotation_z port_tilt_x port_tilt_y tilt_1 "
+    "tilt_2 window_tilt_1 window_tilt_2",
+    ("px", 1.0): "fx fy cx cy",
 }
+_UNIT_OF = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -383,8 +379,13 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
 
     Raises `RigError` as `rig_uncertainty` does.
     """
-    known = set(rig_uncertainty(rig).names)
-    return tuple(one for one in _defaults(rig) if known.isdisjoint(_settled_by(one)))
+    known, found = set(rig_uncertainty(rig).names), []
+    for one in _defaults(rig):
+        names = one.uncertainty.names
+        # The calibration of the dome decides which of its sizes are uncertain.
+        if known.isdisjoint((*names, *_LENS) if names[0] in _SHELL else names):
+            found.append(one)
+    return tuple(found)
 
 
 def completed_uncertainty(rig: Rig) -> RigUncertainty:
@@ -401,13 +402,6 @@ def completed_uncertainty(rig: Rig) -> RigUncertainty:
         covariance[first:stop, first:stop] = part.covariance
         first = stop
     return RigUncertainty(names, covariance)
-
-
-def _settled_by(one: Assumption) -> tuple[str, ...]:
-    """Return the numbers any of which shows that the group was calibrated."""
-    names = one.uncertainty.names
-    # The calibration of the dome decides which of its sizes are uncertain.
-    return (*names, *_LENS) if names[0] in _SHELL else names
 
 
 def _defaults(rig: Rig) -> Iterator[Assumption]:

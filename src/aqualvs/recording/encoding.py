@@ -33,7 +33,7 @@ from aqualvs.scanning.detection import DETECTORS, detector_word
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.target import TargetKind
 from aqualvs.sources.base import bgr_of
 from aqualvs.yamlfile import parse_yaml
 

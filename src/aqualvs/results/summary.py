@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aqualvs.errors import SourceError, check_commas
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.target_file import NetCheck
-from aqualvs.scanning.agreement import LaserAgreement
+from aqualvs.results.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
 from aqualvs.text import count_text

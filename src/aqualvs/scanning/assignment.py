@@ -44,7 +44,13 @@ from aqualvs.scanning.assignment_kernels import (
     stripe_visibility,
     two_longest_stripes,
 )
-from aqualvs.scanning.candidates import Candidates, Subsegments, lit_cells, number_cells
+from aqualvs.scanning.candidates import (
+    Candidates,
+    LinkedCandidates,
+    Subsegments,
+    lit_cells,
+    number_cells,
+)
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, sample_bands
 from aqualvs.scanning.net_surfaces import has_strands_before, inflate_covariance, seen_through
 from aqualvs.scanning.plane_search import MIN_FACING, WEIGHT, X, Z
@@ -155,6 +161,9 @@ NOT_TESTED = AssignmentOutcome(Verdict.CLEAR)
 class AssignmentTest:
     """Tests surfaces of one rig against rival assignments.
 
+    Its methods judge one surface, `target`, of a frame. `linked` are the frame's candidates,
+    `surfaces` all surfaces found in it: light on the others is no evidence against the target.
+
     Parameters
     ----------
     laser_bands : sequence of LaserBand
@@ -179,25 +188,11 @@ class AssignmentTest:
         self.fans = [fan for fan in fans if len(fan) > _FEW]
 
     def is_by_chance(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        surfaces: Sequence[Surface],
-        target: Surface,
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
     ) -> bool:
-        """Return whether a surface may be there by chance: it is small, or shows lasers unevenly.
-
-        Parameters
-        ----------
-        candidates, subsegments
-            As in `test`.
-        surfaces : sequence of Surface
-            All that were found: light on the others is no evidence against this one.
-        target : Surface
-            The one to judge.
-        """
-        share = self._light_share(candidates, subsegments, surfaces, target)
-        visible, faint, dark, _ = self._visibility(target, subsegments)
+        """Return whether a surface may be there by chance: small, or with lasers unevenly shown."""
+        share = self._light_share(linked, surfaces, target)
+        visible, faint, dark, _ = self._visibility(target, linked.subsegments)
         if target.is_mesh and dark > _ODDS.may_be_faint and visible > _ODDS.max_visible_along:
             return share < _ODDS.max_share_along
         # Planes by chance are steep, because there are more steep planes: those that caustics make
@@ -214,26 +209,18 @@ class AssignmentTest:
         return (outweighed or _is_small(target, share, visible)) and faint > _ODDS.may_be_faint
 
     def is_certain(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        surfaces: Sequence[Surface],
-        target: Surface,
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
     ) -> bool:
         """Return whether a surface is there although colour does not tell.
 
         Three lasers show it evenly, and no net is in front: a wall's tallest peaks look like one.
-
-        Parameters
-        ----------
-        candidates, subsegments, surfaces, target
-            As in `is_by_chance`.
         """
+        subsegments = linked.subsegments
         for one in surfaces:
             is_wide = one.is_mesh and one.extent >= _ODDS.min_extent * target.extent
             if one is not target and is_wide and _is_nearer(one, target, subsegments):
                 return False
-        share = self._light_share(candidates, subsegments, surfaces, target)
+        share = self._light_share(linked, surfaces, target)
         visible, faint, _, n_even = self._visibility(target, subsegments)
         few, least = 3, _ODDS.small_share if target.is_mesh else _ODDS.filled
         is_even = n_even >= few and faint <= _ODDS.may_be_faint
@@ -252,31 +239,17 @@ class AssignmentTest:
         return bool(filled >= 1.0 and filled * mean_of_best >= least_of_mean)
 
     def overlooked(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        surfaces: Sequence[Surface],
-        target: Surface,
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
     ) -> Surface | None:
         """Return a surface before the target that may be the net instead, if there is one.
 
         It has light that no other surface explains, all lasers show it, and its stripes are broken;
         a fish shows few lasers and long stripes, and specks on a plane by chance have little light.
-        Of a target that looks like a net itself, it must hide parts.
-
-        Parameters
-        ----------
-        candidates, subsegments, surfaces
-            As in `is_by_chance`.
-        target : Surface
-            The one that was chosen.
-
-        Returns
-        -------
-        Surface or None
-            `is_mesh` is set if it has the pattern of a net, or if the target alternates with it
-            along the stripes; otherwise it may still be a net.
+        Of a target that looks like a net itself, it must hide parts. `is_mesh` of the surface
+        returned is set if it has the pattern of a net, or if the target alternates with it along
+        the stripes; otherwise it may still be a net.
         """
+        subsegments = linked.subsegments
         # A net's shadows may break a wall's stripes finely. A fan shows nearer meshes as well.
         broken = target.is_mesh and not target.is_unbroken
         if broken and self.fans:
@@ -288,7 +261,7 @@ class AssignmentTest:
                 continue
             if broken and one.extent < _ODDS.min_extent * target.extent:
                 continue
-            share = self._light_share(candidates, subsegments, surfaces, one)
+            share = self._light_share(linked, surfaces, one)
             # As wide as the target, it may be a net one of whose strands lies along a sheet.
             is_wide = one.extent >= _ODDS.min_extent * target.n_lines
             visible, faint, _, _ = self._visibility(one, subsegments, along_strand=is_wide)
@@ -302,30 +275,23 @@ class AssignmentTest:
         return None
 
     def may_hide_net(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        shapes: ComponentShapes,
-        surfaces: Sequence[Surface],
-        target: Surface,
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
     ) -> bool:
         """Return whether a net without a plane, all folds, may hang in front of a solid target.
 
         If another surface lies behind the target, it is not a wall behind a net.
-
-        Parameters
-        ----------
-        candidates, subsegments, surfaces, target
-            As in `is_by_chance`.
-        shapes : ComponentShapes
-            Of the candidates' components.
         """
         if target.is_mesh or any(one.plane.offset > target.plane.offset for one in surfaces):
             return False
+        candidates, rows, n_lines = (
+            linked.candidates,
+            linked.subsegments.of_candidate,
+            linked.shapes.n_lines,
+        )
         share = loose_share_before(
             candidates,
-            subsegments.of_candidate,
-            shapes.n_lines,
+            rows,
+            n_lines,
             target.members,
             np.any([one.members for one in surfaces], axis=0),
             target.plane.packed(),
@@ -337,14 +303,11 @@ class AssignmentTest:
         if share > max_loose_share or not self.fans:
             return bool(share > max_loose_share)
         # One of many lasers places nearly all light at the target or behind it.
-        rows, n_lines = subsegments.of_candidate, shapes.n_lines
         return has_strands_before(candidates, rows, n_lines, target.members, target.plane)
 
     def other_lines(
         self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        shapes: ComponentShapes,
+        linked: LinkedCandidates,
         surfaces: Sequence[Surface],
         target: Surface,
         *,
@@ -352,22 +315,16 @@ class AssignmentTest:
     ) -> float | None:
         """Return the light in other lines beside a target's stripes, if it is too much.
 
-        A rig that names only three lasers of 15 finds planes by chance among the stripes of all.
-
-        Parameters
-        ----------
-        candidates, subsegments, shapes, surfaces, target
-            As in `may_hide_net`. A solid surface behind a net that shows as many lasers, at most
-            twice as many, is no other line.
-        has_colour : bool
-            If false, there may be less such light before a net.
+        A rig that names only three lasers of 15 finds planes by chance among the stripes of all. A
+        solid surface behind a net that shows as many lasers, at most twice as many, is no other
+        line. Without colour, there may be less such light before a net.
 
         Returns
         -------
         float or None
             As a share of the target's own light. None if it is no evidence against the target.
         """
-        n_lasers = len(self._along_x)
+        subsegments, n_lasers = linked.subsegments, len(self._along_x)
         n_on_target = _n_lasers_on(target, subsegments)
         if n_on_target > _ODDS.may_be_chance:
             return None
@@ -381,7 +338,12 @@ class AssignmentTest:
             if max(n_on_target, few) <= n_behind and n_on_target >= half * n_behind:
                 behind |= one.members
         share: float = other_lines_share(
-            candidates, subsegments.of_candidate, target.members, behind, shapes, n_lasers
+            linked.candidates,
+            subsegments.of_candidate,
+            target.members,
+            behind,
+            linked.shapes,
+            n_lasers,
         )
         of_net = target.is_mesh and has_colour
         most = _ODDS.max_other_lines_of_net if of_net else _ODDS.max_other_lines
@@ -394,11 +356,6 @@ class AssignmentTest:
         not, the stripes may be those of a wall out of the working range, or, on a steep solid
         target, of a floor or a side wall nearer than that. Without a third laser the less steep
         plane is more likely.
-
-        Parameters
-        ----------
-        subsegments, target
-            As in `is_by_chance`.
         """
         n_lasers, facing = len(self._sheets), target.plane.normal[1]
         first, second, of_others = two_longest_stripes(subsegments, target.members, n_lasers)
@@ -421,11 +378,6 @@ class AssignmentTest:
 
         The wall is seen through a net, which shows as a mesh behind the target: with more lasers,
         though the target fills much of its stripes. Tuned on nets rendered for 5 and 8 lasers.
-
-        Parameters
-        ----------
-        subsegments, surfaces, target
-            As in `is_by_chance`.
         """
         if not target.is_mesh:
             return False
@@ -455,13 +407,10 @@ class AssignmentTest:
         return False
 
     def _light_share(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        surfaces: Sequence[Surface],
-        surface: Surface,
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], surface: Surface
     ) -> float:
         """Return a surface's share of the light that no other surface explains."""
+        candidates, subsegments, _ = linked
         others = np.zeros(subsegments.n, np.bool_)
         for one in surfaces:
             if one is not surface:
@@ -497,15 +446,6 @@ class AssignmentTest:
         Two stripes determine a plane with one redundant number only. Two parts of a folded net may
         fit that by chance, while the third laser, which should be visible there, lights the net
         elsewhere. Other light behind a net is normal; light in front of it is not.
-
-        Parameters
-        ----------
-        subsegments : Subsegments
-            C of them.
-        surfaces : sequence of Surface
-            All that were found.
-        target : Surface
-            The one to judge.
         """
         if not target.is_mesh:
             return None
@@ -516,32 +456,20 @@ class AssignmentTest:
                 return one if self._is_faint(target, subsegments) else None
         return None
 
-    def test(
-        self, candidates: Candidates, subsegments: Subsegments, surface: Surface
-    ) -> AssignmentOutcome:
-        """Test a surface against rival assignments of its peaks.
-
-        Parameters
-        ----------
-        candidates : Candidates
-            N of them.
-        subsegments : Subsegments
-            C of them.
-        surface : Surface
-            The one to test.
-        """
-        n_lasers = len(self._along_x)
+    def test(self, linked: LinkedCandidates, target: Surface) -> AssignmentOutcome:
+        """Test a surface against rival assignments of its peaks."""
+        (candidates, subsegments, _), n_lasers = linked, len(self._along_x)
         if n_lasers < 2:
             return NOT_TESTED
         n_rivals = 6  # Number of rivals that are refined.
         planes = np.empty((n_rivals + 1, 4))
         measures = np.empty((n_rivals + 1, N_MEASURES))
-        planes[0] = surface.plane.packed()
+        planes[0] = target.plane.packed()
         n = find_rivals(
             candidates,
             subsegments.of_candidate,
             subsegments.table,
-            surface.members,
+            target.members,
             *self._searched,
             n_lasers,
             planes,

@@ -120,14 +120,22 @@ class Candidates(NamedTuple):
         """Return the candidates with `pull` subtracted from their positions on the stripe."""
         return self._replace(points=self.points - self.pull[:, None] * self.sensitivity)
 
-    def subsegments(self) -> tuple[Subsegments, ComponentShapes]:
+    def linked(self) -> "LinkedCandidates":
         """Summarise the subsegments by their centroids; describe the components by their shapes."""
         n = count_subsegments(self.subsegment)
         of_candidate, numbers = np.empty(self.n, np.int64), np.empty((4, n), np.int64)
         table, intensity_weight, width = np.empty((7, n)), np.empty(n), np.empty(n)
         shapes = summarise_subsegments(self, of_candidate, table, intensity_weight, width, numbers)
         found = Subsegments(of_candidate, table, intensity_weight, width, *numbers)
-        return found, ComponentShapes(*shapes)
+        return LinkedCandidates(self, found, ComponentShapes(*shapes))
+
+
+class LinkedCandidates(NamedTuple):
+    """The candidates of a frame with what they are linked to."""
+
+    candidates: Candidates
+    subsegments: Subsegments
+    shapes: ComponentShapes  # Of the components.
 
 
 class CandidateTables(NamedTuple):

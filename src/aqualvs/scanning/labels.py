@@ -19,7 +19,7 @@ from aqualvs.geometry.compiled import (
 )
 from aqualvs.geometry.linear_algebra import lower_quantile, n_bins
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Candidates, Subsegments, lit_cells, number_cells
+from aqualvs.scanning.candidates import Candidates, LinkedCandidates, lit_cells, number_cells
 from aqualvs.scanning.patch import height_over, packed_plane
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.posture_estimator import Measurement
@@ -294,9 +294,7 @@ _NOTHING, _NOWHERE = np.empty(0), np.empty(0, np.bool_)
 
 
 def label_candidates(
-    candidates: Candidates,
-    subsegments: Subsegments,
-    shapes: ComponentShapes,
+    linked: LinkedCandidates,
     surfaces: Sequence[Surface],
     target: Surface | None,
     found: Measurement,
@@ -306,12 +304,8 @@ def label_candidates(
 
     Parameters
     ----------
-    candidates : Candidates
-        N of them.
-    subsegments : Subsegments
-        Those of the candidates.
-    shapes : ComponentShapes
-        Of the candidates' components.
+    linked : LinkedCandidates
+        Of a frame.
     surfaces : sequence of Surface
         All that were found.
     target : Surface or None
@@ -330,6 +324,7 @@ def label_candidates(
     listed : int array, shape (P,)
         Row of each point's candidate.
     """
+    candidates, subsegments, shapes = linked
     n, of_candidate = candidates.n, subsegments.of_candidate
     label, explained = np.empty(n, np.uint8), np.zeros(n, np.bool_)
     patch = _target_surface(target, found)

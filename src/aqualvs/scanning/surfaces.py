@@ -1,14 +1,11 @@
-"""Surfaces of a frame, which are planes that several lasers agree on, and the target among them.
+"""Surfaces of a frame: planes that several lasers agree on.
 
 A peak may lie in the bands of several lasers, and has a candidate for each: wrong candidates
 scatter in space, right ones share a plane. Planes are found one after another; peaks that one
-explains are not available to the next, whichever laser they were assigned to. The target is the
-surface to which the posture is measured (`choose_target`).
+explains are not available to the next, whichever laser they were assigned to.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -585,101 +582,3 @@ def _is_dense_net(surface: Surface, surfaces: list[Surface], subsegments: Subseg
         and seen_through(surface.members, other.members, subsegments)
         for other in surfaces
     )
-
-
-class TargetKind(StrEnum):
-    """Kind of surface that the posture is measured to."""
-
-    AUTO = "auto"
-    """A net where there is one, else the largest solid surface."""
-    NET = "net"
-    """Only a mesh-like surface."""
-    SOLID = "solid"
-    """Only a surface with unbroken stripes, or with long lit intervals between gaps."""
-
-
-def as_requested_kind(surfaces: list[Surface], kind: TargetKind) -> list[Surface]:
-    """Return the surfaces; if a solid target is wanted, those with long lit intervals as solid.
-
-    A table with gaps, or a wall whose texture breaks the stripes, may look like a net.
-    """
-    if kind is not TargetKind.SOLID:
-        return surfaces
-    return [replace(one, is_mesh=one.is_mesh and not one.is_unbroken) for one in surfaces]
-
-
-def choose_target(
-    surfaces: Sequence[Surface], kind: TargetKind, working_range: tuple[float, float]
-) -> Surface | None:
-    """Choose the surface to which the posture is measured; None if there is none of the kind.
-
-    Surfaces in the working range are preferred to those outside, and nets to solid surfaces: an
-    object in front of the net (a fish, a box) or behind it (a tank wall) may have more stripe
-    points, but is not the target that the vehicle follows. Of several meshes, the nearest one with
-    a large extent is the net: a fish is smaller, and a wall behind the net, lit through its
-    openings, may look like a mesh as well. A few points left over from a wall that fills the
-    picture are no net.
-
-    Parameters
-    ----------
-    surfaces : sequence of Surface
-        From `find_surfaces`.
-    kind : TargetKind
-        Kind of the target.
-    working_range : (float, float)
-        In metres.
-    """
-    if len(surfaces) == 1:
-        only = surfaces[0]
-        fits = kind is TargetKind.AUTO or (kind is TargetKind.NET) == only.is_mesh
-        return only if fits else None
-    near, far = working_range
-    surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
-    most = max((surface.sampling_weight for surface in surfaces), default=0.0)
-    lines = max((surface.n_lines for surface in surfaces), default=0)
-    extent = max((_extent(surface) for surface in surfaces), default=0.0)
-    # Specks on a plane by chance have less than both shares: of the search lines of the surface
-    # with most of them, and of the largest extent; a sparse net has a large extent. Stripes without
-    # extent have too few intervals for a pattern.
-    lines_share, extent_share = 0.1, 0.5
-    meshes = [
-        one
-        for one in surfaces
-        if one.is_mesh
-        and one.sampling_weight >= WORTH_SHARE * most
-        and (
-            (one.extent > 0.0 and one.n_lines >= lines_share * lines)
-            or _extent(one) >= extent_share * extent
-        )
-    ]
-    solids = [one for one in surfaces if not one.is_mesh]
-    solid = max(solids, key=lambda surface: surface.inlier_weight, default=None)
-    net = _nearest_wide(meshes)
-    if kind is TargetKind.NET:
-        return net
-    return solid if kind is TargetKind.SOLID or net is None else net
-
-
-def _extent(surface: Surface) -> float:
-    """Return the extent of a surface; its number of search lines if its stripes have no gaps."""
-    return max(surface.extent, surface.n_lines)
-
-
-def _nearest_wide(meshes: Sequence[Surface]) -> Surface | None:
-    """Return the nearest mesh with a large extent and weight, else the one with most weight."""
-    wide_share = 0.75  # Least extent, as a share of the largest one.
-    weight_share = 0.35  # Least sampling weight, as a share of the largest one.
-    # Least extent of the mesh with the largest weight, likewise: a fish may hide half of a net.
-    main_share = 0.5
-    widest = max((surface.extent for surface in meshes), default=0.0)
-    # A mesh with long lit intervals may be a wall in a net's shadows: its weight does not count.
-    broken = [surface for surface in meshes if not surface.is_unbroken] or meshes
-    most = max((surface.sampling_weight for surface in broken), default=0.0)
-    wide = [
-        one
-        for one in meshes
-        if one.sampling_weight >= weight_share * most
-        and one.extent >= (main_share if one.sampling_weight >= most else wide_share) * widest
-    ]
-    best = max(meshes, key=lambda surface: surface.sampling_weight, default=None)
-    return min(wide, key=lambda surface: surface.plane.offset, default=best)

@@ -16,11 +16,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aqualvs.errors import AqualvsError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import lazy_borrowing_kernel
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
@@ -63,21 +61,16 @@ class BareLensComparison:
         """
         if not scan.posture:
             return scan.posture
-        points = scan.points
-        most = -(-len(points) // _EVERY)
-        numbers, pixels = np.empty((3, most), np.int64), np.empty((most, 2))
-        n = _pick(points.used, points.laser, points.pixels, self._along_x, numbers, pixels)
-        found, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-        rows, laser, along_x = numbers[:, :n]
-        # Every point is a group of its own: they are not neighbours.
-        all_valid = self._triangulator.triangulate_into(
-            pixels[:n], along_x, laser, rows, found, sensitivity, valid
+        rows = np.flatnonzero(scan.points.used)[::_EVERY]
+        laser = scan.points.laser[rows].astype(np.int64)
+        placed = self._triangulator.triangulate(
+            scan.points.pixels[rows], self._along_x[laser], laser
         )
-        if not all_valid:
-            found, sensitivity, laser = found[valid], sensitivity[valid], laser[valid]
+        valid = placed.valid
+        found, sensitivity = placed.points_in_dome[valid], placed.sensitivity[valid]
         if len(found) < _MIN_POINTS:
             return Refusal(Reason.TOO_FEW_POINTS, "a bare lens would see too few of the points")
-        fit = self._fit(found, sensitivity, laser)
+        fit = self._fit(found, sensitivity, laser[valid])
         if fit is None:
             return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
         n_points, nearest = count_inliers(found, fit.weights)
@@ -90,28 +83,6 @@ class BareLensComparison:
             return None
         shared = shared_error(np.zeros(n))
         return fit_robust(points, sensitivity, np.ones(n), laser, np.zeros(n), start, shared)
-
-
-@lazy_borrowing_kernel
-def _pick(
-    used: BoolArray,
-    laser: NDArray[np.int8],
-    pixels: FloatArray,
-    along_x_of: IntArray,
-    numbers: IntArray,
-    out_pixels: FloatArray,
-) -> int:
-    """Write row, laser and direction of search of some of the points used; how many there are."""
-    n, n_used = 0, 0
-    for i in range(used.shape[0]):
-        if not used[i]:
-            continue
-        if n_used % _EVERY == 0:
-            numbers[0, n], numbers[1, n], numbers[2, n] = i, laser[i], along_x_of[laser[i]]
-            out_pixels[n, 0], out_pixels[n, 1] = pixels[i, 0], pixels[i, 1]
-            n += 1
-        n_used += 1
-    return n
 
 
 T = TypeVar("T")
@@ -212,7 +183,11 @@ class FrameScanner(Protocol):
 
 @runtime_checkable
 class RecordableScanner(FrameScanner, Protocol):
-    """Interface of a scanner that also returns what it computes its scans from."""
+    """Base of scanners that also return what they compute their scans from."""
+
+    def process(self, frame: Frame) -> Scan:
+        """Return the scan of one frame."""
+        return self.process_with_inputs(frame)[0]
 
     def process_with_inputs(self, frame: Frame) -> tuple[Scan, ScanInputs]:
         """Return the scan of one frame, and its inputs."""

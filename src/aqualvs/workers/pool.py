@@ -15,6 +15,7 @@ import mmap
 import os
 import pickle
 import signal
+import sys
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -67,13 +68,6 @@ _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fiel
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
 _ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
 _NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
-
-
-def packed_size(message: Message) -> int:
-    """Return how many bytes of memory `pack` writes."""
-    if isinstance(message, Ended):
-        return 0
-    return _column_ranges(sum(len(result.scan.points) for result in message))[-1][1]
 
 
 def pack(message: Message, memory: NDArray[np.uint8]) -> bytes:
@@ -180,11 +174,9 @@ class SharedMemory:
     @classmethod
     def new(cls) -> Self | None:
         """Return new memory; None where the system has none to share."""
-        if not hasattr(os, "memfd_create"):
-            return None
         try:
             file = os.memfd_create("aqualvs")
-        except OSError:
+        except (AttributeError, OSError):
             return None
         try:
             return cls(file)
@@ -226,7 +218,9 @@ class Sender:
 
     def send(self, message: Message) -> None:
         """Send a message; waits while all slots are full."""
-        n_bytes = packed_size(message)
+        n_bytes = 0
+        if not isinstance(message, Ended):
+            n_bytes = _column_ranges(sum(len(result.scan.points) for result in message))[-1][1]
         if self._memory is None or n_bytes == 0 or n_bytes > _SLOT_BYTES:
             own = np.empty(n_bytes, np.uint8)
             self._pipe.send((pack(message, own), own, n_bytes))
@@ -302,7 +296,11 @@ def serve(
         with SpanReader(job.path, job.rig.size_px) as video:
             while True:
                 part = job.parts[sender.next_part()]
-                frames = frames_of(_pictures(job, part, video), job.rig.shutter)
+                if part.span.kind is SpanKind.VIDEO:
+                    pictures = video.frames(part.span)
+                else:
+                    pictures = image_frames(job.path, part.span, job.fps)
+                frames = frames_of(pictures, job.rig.shutter)
                 for message in _messages(part, job.rig.shutter, frames, processor):
                     sender.send(message)
     except (EOFError, ConnectionError):
@@ -329,12 +327,6 @@ def _messages(
         yield Ended.WHOLE
 
 
-def _pictures(job: PoolJob, part: SpanPart, video: SpanReader) -> Iterator[Frame]:
-    if part.span.kind is SpanKind.VIDEO:
-        return video.frames(part.span)
-    return image_frames(job.path, part.span, job.fps)
-
-
 _MIN_FRAMES = 100
 """Least number of frames to share: fewer are measured before more processes are ready."""
 
@@ -352,12 +344,10 @@ def pool_job(
     `source`: of the dive; a video file or a folder of images can be shared.
     """
     pictures = source_of_pictures(source)
+    last = sys.maxsize if window.stop is None else window.stop
     spans = [(span, *frames_in(span, rig.shutter)) for span in _spans(pictures)]
-    parts = tuple(
-        SpanPart(span, max(first, window.first), _earlier(stop, window.stop))
-        for span, first, stop in spans
-        if max(first, window.first) < _earlier(stop, window.stop)
-    )
+    found = (SpanPart(one, max(first, window.first), min(stop, last)) for one, first, stop in spans)
+    parts = tuple(part for part in found if part.first < part.stop)
     if len(parts) < 2 or parts[-1].stop - parts[0].first < _MIN_FRAMES:
         return None
     fps = pictures.fps or 1.0
@@ -375,10 +365,6 @@ def _spans(source: FrameSource) -> tuple[Span, ...]:
             # The serial reader reports the fault.
             return ()
     return ()
-
-
-def _earlier(stop: int, wanted: int | None) -> int:
-    return stop if wanted is None else min(stop, wanted)
 
 
 @dataclass(slots=True)

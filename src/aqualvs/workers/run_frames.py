@@ -30,6 +30,7 @@ from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
     FrameScanner,
+    RecordableScanner,
     ScanInputs,
     corrected_rows,
     in_blocks,
@@ -39,7 +40,7 @@ from aqualvs.workers.frame_results import (
 from aqualvs.workers.pool import PoolJob, WorkerPool
 
 if TYPE_CHECKING:
-    from aqualvs.calibration.water_index.state import IndexPrior, IndexReading
+    from aqualvs.calibration.water_index.state import IndexReading
     from aqualvs.recording import DiveRecording, RecordedFrame
 
 
@@ -51,20 +52,13 @@ class ReplayedFrame(Frame):
     recorded: "RecordedFrame | None" = None
 
 
-class Replay(Closing):
+class Replay(Closing, RecordableScanner):
     """A recording that is measured again; both `FrameSource` and scanner of a run.
 
-    Parameters
-    ----------
-    request : RunRequest
-        Rig, water and the `chosen` options stand for the recorded ones; an overlay needs pictures
-        even if stripes are not looked for again.
-
-    Raises
-    ------
-    SourceError, RigError, OptionError
-        If the recording or the rig cannot be used, or the recording lacks the pictures that the
-        request needs.
+    Rig, water and the `chosen` options of the request stand for the recorded ones; an overlay needs
+    pictures even if stripes are not looked for again. Raises `SourceError`, `RigError` or
+    `OptionError` if the recording or the rig cannot be used, or the recording lacks the pictures
+    that the request needs.
     """
 
     def __init__(self, path: Path, request: RunRequest) -> None:
@@ -72,8 +66,15 @@ class Replay(Closing):
 
         self._recording = recording = DiveRecording(path)
         self.name = str(path)
-        self.options = _options(recording, request)  # To measure with.
-        self.rig = _rig(recording, request)  # To measure with.
+        # Options and rig to measure with.
+        self.options, no_dome = request.scanner, request.no_dome
+        if request.chosen is not None and recording.options is not None:
+            own = {name: getattr(request.scanner, name) for name in request.chosen}
+            self.options = replace(recording.options, **own)
+        if request.rig is not None:
+            self.rig = prepared_rig(request.rig, request.water, no_dome=no_dome)
+        else:
+            self.rig = in_water(recording.need_rig(), request.water, no_dome=no_dome)
         self.size_px, self.fps = (recording.rig or self.rig).size_px, recording.fps
         self.n_frames = recording.n_frames
         self._follows = request.rig is None and request.water == Water()
@@ -108,10 +109,6 @@ class Replay(Closing):
                 "power, and were left out; the others were measured"
             )
 
-    def process(self, frame: Frame) -> Scan:
-        """Return the scan of a frame of this source."""
-        return self.process_with_inputs(frame)[0]
-
     def process_with_inputs(self, frame: Frame) -> tuple[Scan, ScanInputs]:
         """Return the scan of a frame of this source, with its rig and stripes."""
         recorded = frame.recorded if isinstance(frame, ReplayedFrame) else None
@@ -121,19 +118,15 @@ class Replay(Closing):
             nothing = ScanPoints.none()
             scan = Scan(frame.index, frame.time_s, recorded.refusal, nothing, recorded.n_water)
             return scan, ScanInputs(self.rig, {})
-        scanner = self._scanner_in(recorded.n_water)
-        peaks = recorded.peaks
+        # The water as the dive's run knew it.
+        if self._follows and recorded.n_water != self._scanner.rig.n_water:
+            self._scanner = Scanner(self.rig.in_water(recorded.n_water), self.options)
+        scanner, peaks = self._scanner, recorded.peaks
         if self._detects:
             peaks, scan = scanner.scan(frame)
         else:
             scan = scanner.measure(frame.index, frame.time_s, peaks)
         return replace(scan, turning=recorded.turning), ScanInputs(scanner.rig, peaks)
-
-    def _scanner_in(self, n_water: float) -> Scanner:
-        """Return the scanner for the water of a frame, as the dive's run knew it."""
-        if self._follows and n_water != self._scanner.rig.n_water:
-            self._scanner = Scanner(self.rig.in_water(n_water), self.options)
-        return self._scanner
 
 
 def replay_of(request: RunRequest) -> Replay | None:
@@ -147,19 +140,6 @@ def replay_of(request: RunRequest) -> Replay | None:
     from aqualvs.recording import is_recording
 
     return Replay(path, request) if is_recording(path) else None
-
-
-def _options(recording: "DiveRecording", request: RunRequest) -> ScannerOptions:
-    if request.chosen is None or recording.options is None:
-        return request.scanner
-    own = {name: getattr(request.scanner, name) for name in request.chosen}
-    return replace(recording.options, **own)
-
-
-def _rig(recording: "DiveRecording", request: RunRequest) -> Rig:
-    if request.rig is not None:
-        return prepared_rig(request.rig, request.water, no_dome=request.no_dome)
-    return in_water(recording.need_rig(), request.water, no_dome=request.no_dome)
 
 
 def _detects(recording: "DiveRecording", request: RunRequest, options: ScannerOptions) -> bool:
@@ -209,31 +189,22 @@ def with_losses(
     Frames are counted from `first` on; None takes none of them for lost.
     """
     last_index, last_time_s = 0, 0.0
+    refusal, nothing = Refusal(Reason.CORRUPT_FRAME), ScanPoints.none()
     for frame in frames:
         # Times of lost frames are interpolated linearly.
         step = (frame.time_s - last_time_s) / max(1, frame.index - last_index)
         lost = range(frame.index if first is None else first, frame.index)
-        yield [_lost(i, last_time_s + (i - last_index) * step, n_water) for i in lost], frame
+        times = [(i, last_time_s + (i - last_index) * step) for i in lost]
+        yield [Scan(*at, refusal, nothing, n_water) for at in times], frame
         first = None if first is None else frame.index + 1
         last_index, last_time_s = frame.index, frame.time_s
-
-
-def _lost(index: int, time_s: float, n_water: float) -> Scan:
-    """Return the scan of a frame that could not be decoded."""
-    return Scan(index, time_s, Refusal(Reason.CORRUPT_FRAME), ScanPoints.none(), n_water)
 
 
 class DiveProcessor(Closing):
     """Measurement of a dive's frames; a context manager, within which processes measure.
 
-    Parameters
-    ----------
-    source : FrameSource or Replay
-        Open, and not yet read from.
-    window : FrameWindow
-        Of the frames to measure.
-    job : PoolJob or None
-        How processes may share the dive; None has this process measure it.
+    `source` is open, and not yet read from. `window` is that of the frames to measure, and `job`
+    how processes may share the dive; None has this process measure it.
     """
 
     def __init__(
@@ -273,7 +244,9 @@ class DiveProcessor(Closing):
         # A recording contains its lost frames; frames that it lacks were skipped on purpose.
         first = None if isinstance(self._source, Replay) else self._window.first
         pairs = with_losses(self._frames, first, self._rig.n_water)
-        ahead = _is_at_hand(self._source)
+        # Whether frames come as fast as they are asked for.
+        is_file = isinstance(source_of_pictures(self._source), VideoSource | ImageSource)
+        ahead = is_file and Path(self._source.name).exists()
         processor = FrameProcessor(self._rig, scanner)
         frames = in_blocks(pairs, processor.block_length if ahead else 1)
         yield from result_blocks(read_ahead(frames) if ahead else frames, processor)
@@ -299,59 +272,42 @@ class DiveProcessor(Closing):
         self._stack.close()
 
 
-def _is_at_hand(source: FrameSource) -> bool:
-    """Return whether frames come as fast as they are asked for."""
-    pictures = source_of_pictures(source)
-    return isinstance(pictures, VideoSource | ImageSource) and Path(source.name).exists()
-
-
 # Reading the target's markers takes longer than measuring a frame; the index hardly changes.
 _FIRST_FRAMES, _EVERY_S = 5, 0.4
 
 
-class WaterFollowingScanner:
+class WaterFollowingScanner(RecordableScanner):
     """Scanner that measures each frame in the water as tracked by the index target.
 
-    Parameters
-    ----------
-    rig : Rig
-        In the water to begin with.
-    target : Path
-        Markers on the vehicle (target.yaml).
-    water : Water
-        Temperature and salinity, if given, are a prior.
-
-    Raises
-    ------
-    CalibrationError
-        If the target's file cannot be used.
+    `rig` is in the water to begin with, and `target` holds the markers on the vehicle
+    (target.yaml). Temperature and salinity of `water`, if given, are a prior. Raises
+    `CalibrationError` if the target's file cannot be used.
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
         from aqualvs.calibration.targets.target_files import load_target
         from aqualvs.calibration.water_index.estimator import IndexEstimator
-        from aqualvs.calibration.water_index.state import IndexOptions
+        from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior
 
         if rig.housing is None:
             raise OptionError("--index-target: without a housing the water's index cannot be seen")
         self._rig, self._options, self._target = rig, options, target
         self.scanner = Scanner(rig, options)  # For the water as it is known.
         self._markers = load_target(target)
+        prior = None
+        if water.seawater is not None:
+            prior = IndexPrior.seawater(*water.seawater, n_air=rig.n_air)
         # Accuracy of a user's measurement of the plate's place; only the index is tracked.
         place_mm, turn_deg = 0.2, 0.1
         self._estimator = IndexEstimator(
             rig,
             uncertainty=rig_uncertainty(rig),
-            prior=_prior(water, rig),
+            prior=prior,
             options=IndexOptions.of_target(place_mm, turn_deg),
         )
         self._next_s = -np.inf
         self._n_read = 0
         self._last: IndexReading | None = None
-
-    def process(self, frame: Frame) -> Scan:
-        """Measure a frame in the water as presently known."""
-        return self.process_with_inputs(frame)[0]
 
     def process_with_inputs(self, frame: Frame) -> tuple[Scan, ScanInputs]:
         """Measure a frame, and return the rig and the stripes that it was measured with."""
@@ -404,10 +360,3 @@ class WaterFollowingScanner:
         trusted = reading.sigma < min_sigma_to_follow
         if trusted and abs(reading.n - self.scanner.rig.n_water) > worth:
             self.scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
-
-
-def _prior(water: Water, rig: Rig) -> "IndexPrior | None":
-    from aqualvs.calibration.water_index.state import IndexPrior
-
-    seawater = water.seawater
-    return None if seawater is None else IndexPrior.seawater(*seawater, n_air=rig.n_air)

@@ -37,6 +37,7 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import POSE_PARAMETERS, Camera
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import Rig, RigUncertainty
 
@@ -374,7 +375,10 @@ def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -
 
     `covariance` (P, P) is that of the lens's parameters. NaN where the lens model does not hold.
     """
-    by_number = lens.pixels_with_parameter_jacobian(lens.directions(pixels)[0])[3]
+    directions, _ = lens.directions(pixels)
+    # A point seen by a bare lens in the origin is a direction.
+    bare = Camera(size_px=(1, 1), lens=lens, dome_from_cam=SE3.identity())
+    by_number = bare.project_with_parameter_jacobian(directions)[3][..., len(POSE_PARAMETERS) :]
     spread = np.einsum("nip,pq,niq->ni", by_number, covariance, by_number)
     sigma: FloatArray = np.sqrt(spread.sum(axis=-1))
     return sigma

@@ -11,7 +11,7 @@ from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.solved import with_uncertainty
-from aqualvs.scanning.agreement import (
+from aqualvs.results.agreement import (
     N_BINS,
     AgreementState,
     AgreementVerdict,
