@@ -413,9 +413,9 @@ class HealthMonitor:
         if n < 1:
             return 0.0
         # While frames come the span ends with the last one; in silence the rate falls.
-        last_ns = self._frames[-1].at_ns
-        span_ns = last_ns - self._frames[0].at_ns
-        return n / max(1e-9 * (span_ns + max(0.0, now_ns - last_ns - span_ns / n)), 1e-9)
+        span_ns = self._frames[-1].at_ns - self._frames[0].at_ns
+        silent_ns, period_ns = now_ns - self._frames[-1].at_ns, span_ns / n
+        return n / max(1e-9 * (span_ns + max(0.0, silent_ns - period_ns)), 1e-9)
 
     def _delays(self) -> tuple[StageDelay, ...]:
         if not self._frames:

@@ -337,8 +337,10 @@ class SampleEncoder:
             yield RIG, rig_message(self._rig_texts, stamp_ns)
 
     def _is_new(self, rig: Rig) -> bool:
-        if rig is self._rig or self._rig is None:
-            return self._rig is None
+        if self._rig is None:
+            return True
+        if rig is self._rig:
+            return False
         return self._exact != rig_exact(rig.in_water(self._rig.n_water))
 
     def _pictures(self, frame: Frame, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:

@@ -122,13 +122,14 @@ class DiveRecording:
     def _frame(self, parts: dict[str, StoredMessage]) -> RecordedFrame:
         stripes = parts[STRIPES.name]
         try:
-            found = stripes_of(stripes.data)
-            return RecordedFrame(*found, _picture(found[0], found[1], parts))
+            index, time_s, n_water, peaks, refusal, turning = stripes_of(stripes.data)
+            picture = _picture(index, time_s, parts)
         except (ValueError, AqualvsError) as fault:
             raise SourceError(
                 f"{self.path}: a message cannot be understood ({fault}); "
                 "was it written by a later version?"
             ) from fault
+        return RecordedFrame(index, time_s, n_water, peaks, refusal, turning, picture)
 
 
 def is_recording(path: Path) -> bool:

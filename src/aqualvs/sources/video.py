@@ -95,7 +95,7 @@ class FrameCounter:
         return max(earliest, picture.pts) if picture.key_frame else earliest
 
     def number(self, pts: int | None) -> int:
-        """Return the number of a picture, counting those lost before it.
+        """Return the number of a picture, counting those lost before it; numbers only grow.
 
         `pts`: its time, in ticks of its stream.
         """

@@ -375,6 +375,7 @@ def _angle(
     table = tables.get("ATT")
     if table is None or column not in table:
         return None
+    # Records have no checksum: damaged ones may contain any number.
     largest_deg = 720.0
     angle = np.deg2rad(np.where(np.abs(table[column]) <= largest_deg, table[column], np.nan))
     angle = bearing_of(angle) if interpolation is Interpolation.BEARING else wrap(angle)

@@ -121,13 +121,7 @@ def find_time_offset(
     if isinstance(found, OffsetRefusal):
         return found
     refined = _refine(channels, found)
-    if start is None:
-        return refined
-    difference = start.offset_s - refined.offset_s
-    sigma = math.hypot(refined.sigma_s, start.sigma_s)
-    verdict = "agree" if abs(difference) <= _START_SIGMAS * sigma else "are not to be trusted"
-    how = f"{refined.how}; the clocks {verdict} ({difference:+.1f} s off)"
-    return replace(refined, how=how)
+    return refined if start is None else _compared(refined, start)
 
 
 def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | OffsetRefusal:
@@ -319,6 +313,14 @@ def _sigma(channels: tuple[Channel, ...], offset_s: float) -> float:
     derivative = float(earlier.sum() - later.sum()) / (2.0 * probe_s)
     slope = derivative if derivative > 0.0 else float(curvature.sum())
     return math.sqrt(float(sums @ sums)) / slope
+
+
+def _compared(found: TimeOffset, start: TimeOffset) -> TimeOffset:
+    """Return the offset with a comparison with that of the clocks in its description."""
+    difference = start.offset_s - found.offset_s
+    sigma = math.hypot(found.sigma_s, start.sigma_s)
+    verdict = "agree" if abs(difference) <= _START_SIGMAS * sigma else "are not to be trusted"
+    return replace(found, how=f"{found.how}; the clocks {verdict} ({difference:+.1f} s off)")
 
 
 VIDEO_UTC_SIGMA_S = 5.0

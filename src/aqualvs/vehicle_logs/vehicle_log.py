@@ -72,7 +72,7 @@ class Signal:
     def at(self, time_s: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return the values (m,) at other log times (m,), in any order, and where they are valid.
 
-        Before the first sample, after the last one and inside a gap they are not, and NaN.
+        Before the first sample, after the last one and inside a gap they are NaN and not valid.
         """
         times = np.atleast_1d(np.asarray(time_s, float))
         last = len(self.time_s) - 1

@@ -467,6 +467,10 @@ def test_closing_says_neutral_only_where_efforts_were_sent(wire: Wire) -> None:
         ({"modes": ("MANUAL",)}, "MANUAL"),
         ({"modes": ("GUIDED",)}, "GUIDED"),
         ({"modes": ("ALT_HOLD",), "command": Command.GUIDED}, "ALT_HOLD"),
+        ({"ground_station": 0}, "ground_station 0"),
+        ({"station_timeout_s": 0.0}, "station_timeout_s 0"),
+        ({"speed": math.inf}, "speed inf"),
+        ({"turning_rate": -1.0}, "turning_rate -1"),
         ({"stick_dead_band": 1.0}, "stick_dead_band 1"),
     ],
 )

@@ -18,7 +18,7 @@ from aqualvs.live.outputs.dds import (
     stays_on_this_machine,
     type_hash,
 )
-from aqualvs.live.outputs.ros_messages import TYPE_NAMES, PublishedTopic, plane_pose
+from aqualvs.live.outputs.ros_messages import TYPE_NAMES, PublishedTopic, RosOptions, plane_pose
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.sources.base import State
@@ -74,8 +74,8 @@ def listen() -> Iterator[Listen]:
 def publish() -> Iterator[Publish]:
     outputs = []
 
-    def start(distro: str | None = None) -> DdsOutput:
-        outputs.append(DdsOutput(DOMAIN, distro))
+    def start(options: RosOptions | None = None, **more: Any) -> DdsOutput:
+        outputs.append(DdsOutput(options, domain_id=DOMAIN, **more))
         return outputs[-1]
 
     yield start
@@ -164,6 +164,16 @@ def test_delay_between_processes(listen: Listen, publish: Publish, sample: LiveS
     assert send_until(output, sample, lambda: len(listener.messages("/posture")) > 25)
     # Measured: 1 ms. What the way itself takes is in all of them; a busy machine adds to most.
     assert min(listener.delays_ms("/aqualvs/posture")) < 50.0
+
+
+def test_best_effort_does_not_serve_those_who_want_more(
+    listen: Listen, publish: Publish, sample: LiveSample
+) -> None:
+    output, listener = publish(RosOptions(reliable=False)), listen("jazzy", "reliable")
+    assert send_until(output, sample, lambda: listener.messages("diagnostics"))
+    for _ in range(10):
+        send_now(output, sample)
+    assert listener.messages("/range") == []
 
 
 def test_subscriber_that_stands_still(listen: Listen, publish: Publish, sample: LiveSample) -> None:

@@ -295,6 +295,12 @@ def test_a_speed_that_the_system_does_not_know_is_refused() -> None:
         check_address(SerialAddress("/dev/ttyACM0", 123456))
 
 
+@pytest.mark.parametrize(("name", "value"), [("system", 0), ("component", 256)])
+def test_ids_out_of_range_are_refused(name: str, value: int) -> None:
+    with pytest.raises(OptionError, match=f"{name} id {value}"):
+        LinkOptions(**{name: value})
+
+
 def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20.ardupilotmega", None)
     with pytest.raises(OptionError, match=r"aqualvs\[mavlink\]"):

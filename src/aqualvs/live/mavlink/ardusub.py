@@ -29,7 +29,7 @@ import numpy as np
 
 from aqualvs.control.sticks import FULL, MIDDLE, PARAMETERS, Sticks, shaping_of
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_positive
 from aqualvs.live.mavlink.ardusub_commands import (
     CENTRE_US,
     MAX_US,
@@ -240,7 +240,10 @@ class ArduSubOptions:
     turning_rate: float = math.radians(30.0)
 
     def __post_init__(self) -> None:
-        """Raise `OptionError` for a mode that cannot be steered, or an impossible dead band."""
+        """Check every value.
+
+        Raises `OptionError` if one makes no sense.
+        """
         allowed = _KEEPS_DEPTH[self.command]
         for mode in self.modes:
             if mode not in allowed:
@@ -248,6 +251,12 @@ class ArduSubOptions:
                     f"ArduSub mode {mode}: cannot be steered by {self.command}; choose of "
                     f"{', '.join(allowed)}"
                 )
+        if not 1 <= self.ground_station <= 255:
+            raise OptionError(
+                f"ArduSub ground_station {self.ground_station}: must lie between 1 and 255"
+            )
+        timeout = () if self.station_timeout_s is None else ("station_timeout_s",)
+        check_positive("ArduSub", self, *timeout, "speed", "turning_rate")
         if not 0.0 < self.stick_dead_band < 1.0:
             raise OptionError(
                 f"ArduSub stick_dead_band {self.stick_dead_band:g}: must lie between 0 and 1"

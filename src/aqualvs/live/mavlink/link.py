@@ -73,7 +73,13 @@ class LinkOptions:
     key: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Raise `OptionError` if a peer is no address."""
+        """Check every value.
+
+        Raises `OptionError` if one makes no sense.
+        """
+        for name, value in (("system", self.system), ("component", self.component)):
+            if not 1 <= value <= 255:
+                raise OptionError(f"MAVLink {name} id {value}: must lie between 1 and 255")
         AllowedPeers(self.peers)
 
 

@@ -247,7 +247,8 @@ class PeerTable:
         now_s = time.monotonic()
         home, heard_s = self._homes.get(system, (peer, now_s))
         if home == peer or now_s - heard_s > SILENT_AFTER_S:
-            home, _ = self._homes[system] = peer, now_s
+            home = peer
+            self._homes[system] = peer, now_s
         if system == self._system:
             self._compare(peer, home, _claim(message), now_s)
 

@@ -130,20 +130,32 @@ class _Link(NamedTuple):
 class DdsOutput(Output):
     """Publisher of ROS 2 topics, whether ROS 2 is installed or not.
 
-    `domain_id`: None for `ROS_DOMAIN_ID`, 0 where that is not set. `distro`: release of ROS 2 of
-    the subscribers, such as `humble`: `Range` has changed; None for `ROS_DISTRO`, Jazzy where that
-    is not set. Raises `OptionError` if cyclonedds or rosbags is not installed, or the domain is
-    none.
+    Raises `OptionError` if cyclonedds or rosbags is not installed, or the domain is none.
+
+    Parameters
+    ----------
+    domain_id : int or None
+        None for `ROS_DOMAIN_ID`, 0 where that is not set.
+    distro : str or None
+        Release of ROS 2 of the subscribers, such as `humble`: `Range` has changed. None for
+        `ROS_DISTRO`, Jazzy where that is not set.
     """
 
     name = "ros2"
 
-    def __init__(self, domain_id: int | None = None, distro: str | None = None) -> None:
+    def __init__(
+        self,
+        options: RosOptions | None = None,
+        *,
+        domain_id: int | None = None,
+        distro: str | None = None,
+    ) -> None:
+        self._options = options or RosOptions()
         self._domain_id = domain_of_this_machine() if domain_id is None else domain_id
         if not 0 <= self._domain_id <= _MAX_DOMAIN:
             raise OptionError(f"ROS domain {self._domain_id}: must be 0 to {_MAX_DOMAIN}")
         self._types = dds_types(distro or os.environ.get("ROS_DISTRO") or DEFAULT_DISTRO)
-        self._maker = MessageMaker(RosOptions(), self._types)
+        self._maker = MessageMaker(self._options, self._types)
         self._link: _Link | None = None
         self._closed = False
         self._wait_s, self._retry_s = _FIRST_WAIT_S, 0.0
@@ -186,7 +198,7 @@ class DdsOutput(Output):
         """Return a link; None while there is reason to wait."""
         if self._closed or time.monotonic() < self._retry_s:
             return None
-        self._link = _join(self._domain_id, self._types)
+        self._link = _join(self._domain_id, self._options, self._types)
         self._wait_s = _FIRST_WAIT_S
         return self._link
 
@@ -246,7 +258,7 @@ def stays_on_this_machine(environment: Mapping[str, str] = os.environ) -> bool:
     return local and not environment.get("CYCLONEDDS_URI")
 
 
-def _join(domain_id: int, types: RosTypes) -> _Link:
+def _join(domain_id: int, options: RosOptions, types: RosTypes) -> _Link:
     """Enter the domain and offer all topics."""
     from cyclonedds.domain import DomainParticipant
     from cyclonedds.pub import DataWriter
@@ -258,7 +270,7 @@ def _join(domain_id: int, types: RosTypes) -> _Link:
     for topic in PublishedTopic:
         kind = types.classes[TYPE_NAMES[topic]]
         offered = DdsTopic(participant, f"rt{topic.full_name}", kind)
-        writers[topic] = DataWriter(participant, offered, _qos(topic, types))
+        writers[topic] = DataWriter(participant, offered, _qos(topic, options, types))
     return _Link(domain, participant, writers)
 
 
@@ -276,13 +288,15 @@ def _domain(domain_id: int) -> Any:
         raise
 
 
-def _qos(topic: PublishedTopic, types: RosTypes) -> Any:
+def _qos(topic: PublishedTopic, options: RosOptions, types: RosTypes) -> Any:
     depth = 5
     from cyclonedds.qos import Policy, Qos
 
+    reliable = options.reliable or topic is PublishedTopic.DIAGNOSTICS
     policies = [
-        # Every subscriber fits, also those that ask for best effort.
-        Policy.Reliability.Reliable(max_blocking_time=_MAX_BLOCKING_NS),
+        Policy.Reliability.Reliable(max_blocking_time=_MAX_BLOCKING_NS)
+        if reliable
+        else Policy.Reliability.BestEffort,
         Policy.Durability.Volatile,
         Policy.History.KeepLast(depth),
         Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
