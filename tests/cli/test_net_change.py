@@ -147,6 +147,21 @@ def test_without_a_log_whole_dives_are_compared_and_it_says_so(cage, tmp_path, c
     )
 
 
+def test_dives_without_any_solidity_are_no_fault(cage, tmp_path, capsys):
+    """Too few strands in every stretch: there is no mean to draw for any date."""
+    runs = []
+    for day in (0, 21):
+        one = dive(cage, day, bearings=(0.0, 80.0))
+        unknown = np.full(len(one.stretches.solidity), np.nan)
+        one = replace(one, stretches=replace(one.stretches, solidity=unknown))
+        runs.append(str(write(one, tmp_path / f"2026-05-{1 + day:02d}")))
+    out = tmp_path / "out"
+    assert main(["net-change", *runs, "-o", str(out)]) == 0
+    assert "places are not compared, only whole dives" in capsys.readouterr().out
+    assert rows(out / "net_change.csv") == []
+    assert (out / "net_change.png").stat().st_size > 1000
+
+
 def test_the_date_is_told_by_the_user_the_names_or_the_video(cage, tmp_path, capsys):
     runs = [
         written(cage, tmp_path / name, 7 * i) for i, name in enumerate(["x", "y", "2026-07-01"])

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aqualvs.batch.work import _FORMAT
 from aqualvs.nets.target_file import NetCheck, NetFacts
 from aqualvs.results.agreement import LaserAgreement
 from aqualvs.results.summary import RunSummary
@@ -115,6 +116,14 @@ def test_the_net_is_looked_at_in_the_same_frames(tmp_path, monkeypatch):
     whole, parts = of(scans, checked), joined(scans, [7, 8], tmp_path, checked)
     assert parts.net_check.bars == whole.net_check.bars
     assert len(whole.net_check.bars) == 5
+
+
+def test_other_arrays_in_the_file_need_another_format_of_pieces(tmp_path):
+    """A batch goes on with the pieces of an earlier version unless the format differs."""
+    found = RunSummary(net_check=NetCheck(NetFacts("square", 0.025), "net.yaml", ()))
+    found.save(tmp_path / "part.npz")
+    with np.load(tmp_path / "part.npz") as file:
+        assert (_FORMAT, set(file.files)) == (4, {"ranges", "refusals", "bars"})
 
 
 def test_a_refusal_for_the_commonest_reason_is_told_in_words():

@@ -29,7 +29,7 @@ from aqualvs.sources.video import VideoSource
 PIECE_FRAMES = 1500
 """Frames that a piece has at least: a minute of video, seconds of work."""
 
-_FORMAT = 3
+_FORMAT = 4
 """Of what pieces hold; another one makes old pieces worthless."""
 
 

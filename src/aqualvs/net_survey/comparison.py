@@ -311,7 +311,10 @@ class Comparison:
 
 
 def compare(surveys: Sequence[Survey], cell: float) -> Comparison:
-    """Compare dives along the same net, of two dates or more, by cells of a side in metres."""
+    """Compare dives along the same net, of two dates or more.
+
+    `cell`: side of the cells in metres.
+    """
     ordered = sorted(surveys, key=lambda one: (one.date, one.name))
     dates = sorted({one.date for one in ordered})
     whole = [_mean_solidity(one for one in ordered if one.date == day) for day in dates]

@@ -228,7 +228,9 @@ def _dates(result: Comparison) -> Figure:
     axes = figure.subplots()
     known = [(d, one) for d, one in zip(result.dates, result.whole, strict=True) if one]
     days = [day.toordinal() for day, _ in known]
-    values, sigmas = 100.0 * np.array([(one.value, one.sigma) for _, one in known]).T
+    # No date is known where solidity was measured nowhere.
+    means = np.array([(one.value, one.sigma) for _, one in known]).reshape(-1, 2)
+    values, sigmas = 100.0 * means.T
     axes.errorbar(days, values, sigmas, fmt="o-", color=DARK, capsize=4.0)
     axes.set_xticks(days, [day.isoformat() for day, _ in known])
     axes.margins(x=0.12)

@@ -276,7 +276,8 @@ class LatticeFitter:
         """Find the place and velocity common to some frames; None where they are too few.
 
         A single frame may be off, and from frame to frame the net may move by nearly half a mesh:
-        several frames together separate the two. The velocity changes little meanwhile.
+        several frames together separate the two. The velocity changes little meanwhile. `times_s`:
+        of the frames, one for each.
         """
         usable = [i for i, one in enumerate(crossings) if len(one.place) >= _TRACK.min_crossings]
         if len(usable) < _TRACK.min_frames:

@@ -94,8 +94,8 @@ class Spectrum:
         self.crossings, self.lines, self.laser, self.lit = crossings, lines, laser, lit
         self.n_frames, self.n_crossings = len(crossings.start) - 1, len(crossings.place)
         self.per_frame = self.n_crossings / self.n_frames
-        # Crossings of each laser, shape (L,).
         seen = np.bincount(crossings.line, minlength=len(lines))
+        # Crossings of each laser, shape (L,).
         self.seen = np.bincount(laser, seen, minlength=laser.max(initial=0) + 1)
 
     @classmethod

@@ -222,9 +222,20 @@ def wave_sums(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the sums of waves over places, less those expected over spans.
 
-    Of one frame: `place`, shape (N, 2), its crossings; `begin` and `end`, (M, 2), the ends of the
-    visible pieces of line; `expected`, (M,), the crossings expected on each. Of wave vectors
-    (Q, 2), real and imaginary parts, shape (Q,) each.
+    Parameters
+    ----------
+    place : array, shape (N, 2)
+        Crossings of one frame.
+    begin, end : array, shape (M, 2)
+        Ends of the visible pieces of line.
+    expected : array, shape (M,)
+        Crossings expected on each.
+    waves : array, shape (Q, 2)
+        Wave vectors.
+
+    Returns
+    -------
+    real, imaginary : array, shape (Q,)
     """
     real, imaginary = np.zeros(len(waves)), np.zeros(len(waves))
     for k in range(len(waves)):
@@ -349,8 +360,14 @@ def miscount(
 ) -> float:
     """Return the penalty for the numbers of crossings that the lasers have seen.
 
-    `families`, shape (F, 2): waves of the strands, of each of which a share `density` of the lines
-    exists. The rest are attributes of `Spectrum`.
+    Parameters
+    ----------
+    lines, laser, seen, lit, n_frames
+        As attributes of `Spectrum`.
+    families : array, shape (F, 2)
+        Waves of the strands.
+    density : float
+        Share of each family's lines that exists.
     """
     expected = np.zeros(len(seen))
     for i in range(len(lines)):

@@ -94,7 +94,10 @@ def stretches(track: Track) -> list[Stretch]:
 
 
 def merge_stretches(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:
-    """Return stretches joined across gaps too narrow to see: below a column of the screen."""
+    """Return stretches joined across gaps too narrow to see: below a column of the screen.
+
+    `columns`: of the screen, across the dive; about as many stretches remain.
+    """
     least = float(track.time_s[-1] - track.time_s[0]) / columns
     joined: list[Stretch] = []
     for stretch in found:

@@ -151,11 +151,11 @@ _KILLED = "the run ended before it could close its files; the folder was complet
 
 
 class RunOutputs:
-    """Writer of a folder of `prepare_folder`; a context manager that completes it at the run's end.
+    """Writer of a run's folder; a context manager that completes it however the run ends.
 
-    Source, rig and options are for `run.yaml`; frames are added to the summary, whose monitors are
-    those of the run. Every method raises `OutputError` if the disk is full or the folder cannot be
-    written.
+    `folder` is from `prepare_folder`. Source, rig and options are for `run.yaml`; frames are added
+    to the summary, whose monitors are those of the run. Every method raises `OutputError` if the
+    disk is full or the folder cannot be written.
     """
 
     def __init__(
