@@ -283,10 +283,22 @@ def assign_lasers(
 ) -> LaserAssignment:
     """Assign stripe points to the laser planes that they lie in.
 
-    The lasers are all planes with clear evidence, even more than `n_lasers`, the number that shine.
-    If there are fewer, they are also the best undecided ones, if these are clearly better than the
-    other undecided ones. A plane through the lens's projection centre, `lens_in_dome` (3,), is no
-    laser. `tolerance_px` is the greatest distance of a stripe from its plane.
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all views.
+    lens_in_dome : array, shape (3,)
+        The lens's projection centre; a plane through it is no laser.
+    n_lasers : int, optional
+        Number of lasers that shine; by default all planes with clear evidence.
+    tolerance_px : float
+        Greatest distance of a stripe from its plane.
+
+    Returns
+    -------
+    LaserAssignment
+        All planes with clear evidence, even more than `n_lasers`. If there are fewer, also the best
+        undecided ones, if they are clearly better than the other undecided ones.
     """
     lines = _all_lines(pooled)
     table = LineTable.of(pooled, lines, tolerance_px)
