@@ -216,10 +216,10 @@ class DetectedTargets:
         for view in self.views:
             for note in view.notes:
                 names.setdefault(note, []).append(view.name)
-        notes = []
+        notes, n_shown = [], 3
         for note, where in names.items():
-            more = f" and {len(where) - 3} more" if len(where) > 3 else ""
-            notes.append(f"{', '.join(where[:3])}{more}: {note}")
+            more = f" and {len(where) - n_shown} more" if len(where) > n_shown else ""
+            notes.append(f"{', '.join(where[:n_shown])}{more}: {note}")
         return notes
 
 
