@@ -468,8 +468,13 @@ def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
 
 def corner_residuals(views: Sequence[ViewFit], size_px: tuple[int, int]) -> ResidualMap:
     """Return the map of the residuals of all views' corners over the picture."""
-    parts = zip(*((fit.view, fit.residuals, fit.inliers) for fit in views), strict=True)
-    return residual_map("Corners of all views", size_px, *parts)
+    return residual_map(
+        "Corners of all views",
+        size_px,
+        [fit.view for fit in views],
+        [fit.residuals for fit in views],
+        [fit.inliers for fit in views],
+    )
 
 
 def corner_rows(views: Sequence[ViewFit], missed: Mapping[str, str]) -> tuple[ViewRow, ...]:

@@ -87,8 +87,9 @@ def judged(
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to distinguish it from chance"
+        verdict, why = fault or (PlaneVerdict.LASER, "")
         patches = tuple(np.unique(pooled.patch[candidates[i].members]).tolist())
-        seen.append(JudgedPlane(candidates[i], patches, *(fault or (PlaneVerdict.LASER, ""))))
+        seen.append(JudgedPlane(candidates[i], patches, verdict, why))
     ranks = list(PlaneVerdict)
     return sorted(seen, key=lambda j: (ranks.index(j.verdict), j.candidate.log_false_alarms))
 
