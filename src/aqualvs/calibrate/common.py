@@ -216,10 +216,10 @@ class DetectedTargets:
         for view in self.views:
             for note in view.notes:
                 names.setdefault(note, []).append(view.name)
-        notes = []
+        notes, n_shown = [], 3
         for note, where in names.items():
-            more = f" and {len(where) - 3} more" if len(where) > 3 else ""
-            notes.append(f"{', '.join(where[:3])}{more}: {note}")
+            more = f" and {len(where) - n_shown} more" if len(where) > n_shown else ""
+            notes.append(f"{', '.join(where[:n_shown])}{more}: {note}")
         return notes
 
 
@@ -468,8 +468,13 @@ def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
 
 def corner_residuals(views: Sequence[ViewFit], size_px: tuple[int, int]) -> ResidualMap:
     """Return the map of the residuals of all views' corners over the picture."""
-    parts = zip(*((fit.view, fit.residuals, fit.inliers) for fit in views), strict=True)
-    return residual_map("Corners of all views", size_px, *parts)
+    return residual_map(
+        "Corners of all views",
+        size_px,
+        [fit.view for fit in views],
+        [fit.residuals for fit in views],
+        [fit.inliers for fit in views],
+    )
 
 
 def corner_rows(views: Sequence[ViewFit], missed: Mapping[str, str]) -> tuple[ViewRow, ...]:

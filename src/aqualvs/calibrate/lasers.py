@@ -153,11 +153,8 @@ def calibrate_lasers(
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
     elsewhere = medium is not None or before.is_air(target.n_medium)
-    planned = None if before.lasers else before.solved_from.get(common.N_LASERS)
-    if n_lasers is None and names is not None:
-        n_lasers = len(names)
-    elif n_lasers is None and isinstance(planned, int):
-        n_lasers = planned
+    if n_lasers is None:
+        n_lasers = _planned_count(before) if names is None else len(names)
     with common.counting_missed(target.found):
         result = solve_lasers(
             before,
@@ -269,6 +266,12 @@ def _wavelength(given: float | None, rig: Rig) -> float | None:
     if not rig.lasers and isinstance(planned, int | float):
         return float(planned)
     return common_wavelength(rig.lasers)
+
+
+def _planned_count(rig: Rig) -> int | None:
+    """Return the planned number of lasers of a rig without lasers; None otherwise."""
+    planned = rig.solved_from.get(common.N_LASERS)
+    return planned if isinstance(planned, int) and not rig.lasers else None
 
 
 def _detected(

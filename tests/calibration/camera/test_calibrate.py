@@ -9,7 +9,7 @@ import pytest
 from aqualvs.calibration.camera.calibrate import COVERAGE_CELLS, CameraCalibration, camera, coverage
 from aqualvs.calibration.camera.problem import fitted_camera, gain_of_coefficients
 from aqualvs.calibration.targets.targets import View
-from aqualvs.errors import CalibrationError
+from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.lens import Lens, LensModel
@@ -125,6 +125,12 @@ def test_takes_the_number_that_it_is_told() -> None:
     assert len(found.lens.distortion) == 5
     # k3 is not there, and its uncertainty says so.
     assert abs(_normalised(found, LENS)[8]) < 3.0
+
+
+@pytest.mark.parametrize("n_coefficients", [3, -1])
+def test_refuses_a_number_of_coefficients_that_no_lens_has(n_coefficients: int) -> None:
+    with pytest.raises(RigError, match="takes 0 or 4 or 5 or 8"):
+        camera(_shots(), SIZE, n_coefficients=n_coefficients)
 
 
 def test_solves_a_fisheye_lens() -> None:

@@ -168,10 +168,20 @@ def camera(
 ) -> CameraCalibration:
     """Solve the intrinsics.
 
-    `views` are of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of
-    them; `size_px` is the image's width and height. By default the lens has as many distortion
-    coefficients as the views support. Raises `CalibrationError` if the views are too few or too
-    much alike to determine the intrinsics, or do not show the given board.
+    Parameters
+    ----------
+    views : sequence of View
+        Of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of them.
+    size_px : (int, int)
+        Image width and height.
+    n_coefficients : int, optional
+        Number of distortion coefficients; by default as many as the views support.
+
+    Raises
+    ------
+    CalibrationError
+        If the views are too few or too much alike to determine the intrinsics, or do not show the
+        given board.
     """
     check_camera_views(views, size_px)
     bundle, solution = fitted_camera(views, size_px, model, n_coefficients)

@@ -8,7 +8,6 @@ corners, so the bend is solved together with them, and only if the views show it
 (`bend_is_significant`).
 """
 
-import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -316,8 +315,10 @@ def _lenses(
     views: Sequence[View], size_px: tuple[int, int], model: LensModel, n_coefficients: int
 ) -> Iterator[Lens]:
     if model is LensModel.OPENCV:
-        with contextlib.suppress(cv2.error, RigError):
-            yield _by_opencv(views, size_px, n_coefficients)
+        found = _by_opencv(views, size_px)
+        if found is not None:
+            # A number of coefficients that no lens has is a fault of the caller, not of OpenCV.
+            yield replace(found, distortion=(*found.distortion, *(0.0,) * 4)[:n_coefficients])
     fisheye = model is LensModel.FISHEYE
     for field in _FISHEYE_FIELDS if fisheye else _FIELDS:
         focal = size_px[0] / field if fisheye else 0.5 * size_px[0] / np.tan(0.5 * field)
@@ -331,20 +332,22 @@ def _lenses(
         )
 
 
-def _by_opencv(views: Sequence[View], size_px: tuple[int, int], n_coefficients: int) -> Lens:
+def _by_opencv(views: Sequence[View], size_px: tuple[int, int]) -> Lens | None:
     points = [v.points.astype(np.float32) for v in views]
     pixels = [v.pixels.astype(np.float32) for v in views]
-    _, matrix, distortion, _, _ = cv2.calibrateCamera(
-        points, pixels, size_px, None, None, flags=cv2.CALIB_FIX_K3
-    )
-    coefficients = (*map(float, np.ravel(distortion)[:4]), *(0.0,) * 4)
-    return Lens(
-        fx=float(matrix[0, 0]),
-        fy=float(matrix[1, 1]),
-        cx=float(matrix[0, 2]),
-        cy=float(matrix[1, 2]),
-        distortion=coefficients[:n_coefficients],
-    )
+    try:
+        _, matrix, distortion, _, _ = cv2.calibrateCamera(
+            points, pixels, size_px, None, None, flags=cv2.CALIB_FIX_K3
+        )
+        return Lens(
+            fx=float(matrix[0, 0]),
+            fy=float(matrix[1, 1]),
+            cx=float(matrix[0, 2]),
+            cy=float(matrix[1, 2]),
+            distortion=tuple(map(float, np.ravel(distortion)[:4])),
+        )
+    except (cv2.error, RigError):
+        return None
 
 
 def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bundle:

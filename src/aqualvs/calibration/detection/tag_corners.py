@@ -431,8 +431,16 @@ class TagFit:
 def refine_tags(image: GreyImage, ids: IntArray, quads: FloatArray, family: str) -> TagFit:
     """Refine the corners of markers by a fit to the picture.
 
-    `ids` (M,) are the numbers of the markers in their dictionary, `family`; `quads` (M, 4, 2) the
-    approximate places of their corners, in OpenCV's order, pixels.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    ids : int array, shape (M,)
+        Numbers of the markers in their dictionary.
+    quads : array, shape (M, 4, 2)
+        Approximate places of their corners, in OpenCV's order, pixels.
+    family : str
+        Name of the dictionary.
     """
     image = np.ascontiguousarray(image)
     pixels, sigma = np.full((len(ids), 4, 2), np.nan), np.full((len(ids), 4), np.nan)

@@ -383,6 +383,11 @@ def check_count(
             "may also be from lasers: "
             f"{_planes(split.undecided, places)}; give their number (--lasers N), or {remedy}"
         )
+    return _other_light(split, places, len(views))
+
+
+def _other_light(split: LaserAssignment, places: Sequence[str], n_views: int) -> list[str]:
+    """Return warnings of planes of light and stripes that are not taken for lasers."""
     named_planes = [
         plane
         for plane in split.spare
@@ -394,14 +399,14 @@ def check_count(
     ]
     # Their stripes need no further remark; those of other planes do.
     taken = [line for plane in named_planes for line in plane.candidate.members.tolist()]
-    counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
+    counts = np.bincount(split.laser[split.laser >= 0], minlength=len(split.planes))
     # Share of the weakest laser's points in a picture from which a further stripe is reported.
     as_strong = 0.5
     unmatched = [
         line
         for line in split.unmatched
         # The lasers' counts are over all pictures, a line is in one.
-        if len(line.members) >= as_strong * counts.min() / len(views)
+        if len(line.members) >= as_strong * counts.min() / n_views
         and not np.isin(line.members, taken).any()
     ]
     if unmatched:

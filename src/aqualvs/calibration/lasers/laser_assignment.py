@@ -87,8 +87,9 @@ def judged(
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to distinguish it from chance"
+        verdict, why = fault or (PlaneVerdict.LASER, "")
         patches = tuple(np.unique(pooled.patch[candidates[i].members]).tolist())
-        seen.append(JudgedPlane(candidates[i], patches, *(fault or (PlaneVerdict.LASER, ""))))
+        seen.append(JudgedPlane(candidates[i], patches, verdict, why))
     ranks = list(PlaneVerdict)
     return sorted(seen, key=lambda j: (ranks.index(j.verdict), j.candidate.log_false_alarms))
 
@@ -283,10 +284,22 @@ def assign_lasers(
 ) -> LaserAssignment:
     """Assign stripe points to the laser planes that they lie in.
 
-    The lasers are all planes with clear evidence, even more than `n_lasers`, the number that shine.
-    If there are fewer, they are also the best undecided ones, if these are clearly better than the
-    other undecided ones. A plane through the lens's projection centre, `lens_in_dome` (3,), is no
-    laser. `tolerance_px` is the greatest distance of a stripe from its plane.
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all views.
+    lens_in_dome : array, shape (3,)
+        The lens's projection centre; a plane through it is no laser.
+    n_lasers : int, optional
+        Number of lasers that shine; by default all planes with clear evidence.
+    tolerance_px : float
+        Greatest distance of a stripe from its plane.
+
+    Returns
+    -------
+    LaserAssignment
+        All planes with clear evidence, even more than `n_lasers`. If there are fewer, also the best
+        undecided ones, if they are clearly better than the other undecided ones.
     """
     lines = _all_lines(pooled)
     table = LineTable.of(pooled, lines, tolerance_px)

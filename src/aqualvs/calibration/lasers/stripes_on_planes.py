@@ -328,8 +328,16 @@ def points_on(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points where pixels meet their surfaces, and the normals there, (N, 3) each.
 
-    The camera looks into the medium of the picture. `surface` (N,) has indices into `planes`, the
-    target's surfaces in `dome`, whose normals may have any length.
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    pixels : array, shape (N, 2)
+        Of the picture.
+    surface : int array, shape (N,)
+        Index into `planes`.
+    planes : sequence of Plane
+        The target's surfaces in `dome`; their normals may have any length.
     """
     rays = camera.rays(pixels)
     normals = np.stack([plane.normal for plane in planes])[surface]

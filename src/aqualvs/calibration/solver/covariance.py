@@ -234,10 +234,22 @@ def view_covariance(
 ) -> ViewCovariance:
     """Estimate the covariance of shared parameters from views with a pose each.
 
-    There is one block, one mask of inlier corners and one noise scale for each view, at the
-    solution or near it. `shared` (S,) are the columns that all views share; a block's other columns
-    belong to its pose alone. Raises `CalibrationError` if the views give no information on one of
-    the parameters.
+    Parameters
+    ----------
+    blocks : sequence of Block
+        One for each view, at the solution or near it. Columns that are not shared
+        belong to its pose alone.
+    inliers : sequence of bool array, shape (N,)
+        Inlier corners.
+    scales : sequence of float
+        Noise of each view as a multiple of the nominal one.
+    shared : int array, shape (S,)
+        Columns of the parameters that all views share.
+
+    Raises
+    ------
+    CalibrationError
+        If the views give no information on one of the parameters.
     """
     each = zip(blocks, inliers, scales, strict=True)
     own, pulls = zip(*(_without_pose(*one, shared) for one in each), strict=True)

@@ -360,8 +360,14 @@ def turned_square(
     The pictures do not determine this turn: through a sphere it changes nothing. The turn chosen
     makes one of the boards exactly square and leaves the smallest robust tilt of the others.
 
-    `square` (3, 3) is the rotation of a square board, `boards` are the indices of those most of
-    which are square, `sigma` is the standard deviation of their tilt, in radians.
+    Parameters
+    ----------
+    square : array, shape (3, 3)
+        Rotation of a square board.
+    boards : sequence of int
+        Indices of boards most of which are known to be square.
+    sigma : float
+        Standard deviation of their tilt, in radians.
     """
     tilts = np.array([rotvec_from_rotation(poses[i].rotation @ square.T) for i in boards])
     apart = np.sum((tilts[:, None] - tilts[None]) ** 2, axis=-1)

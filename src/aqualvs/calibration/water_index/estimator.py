@@ -448,10 +448,25 @@ def calibrate_water(
 ) -> WaterCalibration:
     """Find the index of the medium from pictures of a target fixed on the vehicle.
 
-    Points of the target are in `dome`, metres. `times` are in seconds, ascending; without them all
-    pictures are simultaneous. Without a prior of the index at the first picture the rig's own is
-    the initial guess; without an uncertainty the rig is exact. Raises `CalibrationError` if the rig
-    has no housing or no picture can be used.
+    Parameters
+    ----------
+    rig : Rig
+        Behind a housing; its own index is the initial guess without a prior.
+    views : sequence of View
+        Points of the target in `dome`, metres.
+    times : sequence of float, optional
+        Of the pictures, in seconds, ascending. Without them all pictures are simultaneous.
+    uncertainty : RigUncertainty, optional
+        Of the rig; without it the rig is taken as exact.
+    prior : IndexPrior, optional
+        Prior of the index at the first picture.
+    options : IndexOptions
+        Assumptions about target and medium.
+
+    Raises
+    ------
+    CalibrationError
+        If the rig has no housing or no picture can be used.
     """
     known = RigUncertainty.none() if uncertainty is None else uncertainty
     estimator = IndexEstimator(rig, uncertainty=known, options=options, prior=prior)

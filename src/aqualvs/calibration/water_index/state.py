@@ -188,9 +188,16 @@ class IndexState:
         """Return the state with corner errors valid at the pixels of the corners.
 
         The error of a detector depends on the place of a corner within its pixel: after a motion of
-        the picture by a good part of a pixel, new errors, of standard deviation `sigma_px`, replace
-        the old ones. `ids` are the corners of a picture, all known, `pixels` (M, 2) their predicted
-        places.
+        the picture by a good part of a pixel, new errors replace the old ones.
+
+        Parameters
+        ----------
+        ids : tuple of int
+            Corners of a picture, all known.
+        pixels : array, shape (M, 2)
+            Their predicted places.
+        sigma_px : float
+            Standard deviation of the errors.
         """
         rows = [self.ids.index(i) for i in ids]
         moved = pixels - self.seen_at[rows]
@@ -227,10 +234,18 @@ class IndexState:
 
 
 def first_state(time: float, n: float, pose_sigmas: FloatArray, camera: FloatArray) -> IndexState:
-    """Return the state before any frame, at a time in seconds, with an initial guess of the index.
+    """Return the state before any frame.
 
-    `pose_sigmas` (6,) are of the target's place: turn (radians) and shift (metres); `camera` (C, C)
-    is the covariance of the camera's numbers.
+    Parameters
+    ----------
+    time : float
+        In seconds.
+    n : float
+        Initial guess of the index.
+    pose_sigmas : array, shape (6,)
+        Of the target's place: turn (radians) and shift (metres).
+    camera : array, shape (C, C)
+        Covariance of the camera's numbers.
     """
     size = FIRST_CAMERA + len(camera)
     mean, covariance = np.zeros(size), np.zeros((size, size))
