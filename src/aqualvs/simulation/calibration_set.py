@@ -37,13 +37,21 @@ _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetSize:
-    """Numbers of pictures of each kind, at least one of each."""
+    """Numbers of pictures of each kind, at least one of each.
+
+    Attributes
+    ----------
+    camera, dome, box, index : int
+        Of a board in air, of a board in water, of the box with stripes, of the index target.
+    dive : int
+        Frames of a dive before a wall; 0 leaves it out.
+    """
 
     camera: int = 12
     dome: int = 10
     box: int = 4
     index: int = 5
-    dive: int = 12  # Frames of a dive before a wall; 0 leaves it out.
+    dive: int = 12
 
     @property
     def total(self) -> int:
@@ -53,26 +61,40 @@ class SetSize:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFiles:
-    """Files and folders written by `simulate_calibration`."""
+    """Files and folders written by `simulate_calibration`.
 
-    nominal: Path  # Nominal rig: name, size of the pictures, dome, number of lasers.
-    # Folders of pictures.
+    Attributes
+    ----------
+    nominal : Path
+        Nominal rig: name, size of the pictures, dome, number of lasers.
+    camera, dome, box, index : Path
+        Folders of pictures.
+    board, rail_board, box_file, target : Path
+        Files of their targets: two `board.yaml`, `box.yaml`, `target.yaml`.
+    poses : Path or None
+        `poses.csv` of the boards in water; None for a flat port.
+    dive, dive_truth : Path or None
+        Video of a wall and its truth.
+    rig : Path
+        The true rig.
+    n_pictures : int
+        Pictures and frames.
+    """
+
+    nominal: Path
     camera: Path
     dome: Path
     box: Path
     index: Path
-    # Files of their targets: two `board.yaml`, `poses.csv` (None for a flat port), `box.yaml`,
-    # `target.yaml`.
     board: Path
     rail_board: Path
     poses: Path | None
     box_file: Path
     target: Path
-    # Video of a wall and its truth.
     dive: Path | None
     dive_truth: Path | None
-    rig: Path  # The true rig.
-    n_pictures: int  # Pictures and frames.
+    rig: Path
+    n_pictures: int
 
 
 @dataclass(slots=True)
