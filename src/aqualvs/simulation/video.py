@@ -31,8 +31,9 @@ class Compression:
     # lossless H.264 in RGB; or every frame as a separate JPEG (4:2:0, full range), as from USB
     # cameras.
     codec: Codec = "h264"
-    # Quality of "h264", 0 to 51; smaller is better.
+    # Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
     crf: int = 20
+    bit_rate: int | None = None  # Bits a second of "h264".
     jpeg_quality: int = 80  # Of "mjpeg", 1 to 100; larger is better.
 
     def __post_init__(self) -> None:
@@ -40,6 +41,8 @@ class Compression:
             raise OptionError(f"codec is {self.codec!r}; choose h264, lossless or mjpeg")
         if not 0 <= self.crf <= 51:
             raise OptionError(f"crf is {self.crf}; it must lie between 0 and 51")
+        if self.bit_rate is not None and self.bit_rate <= 0:
+            raise OptionError(f"bit rate is {self.bit_rate}; it must be positive")
         if not 1 <= self.jpeg_quality <= 100:
             raise OptionError(f"JPEG quality is {self.jpeg_quality}; it must lie between 1 and 100")
 
@@ -92,10 +95,10 @@ class VideoWriter(Closing):
         elif codec == "libx264rgb":
             stream.pix_fmt = "rgb24"
             stream.options = {"qp": "0", "preset": "veryfast"}
-        elif codec == "libx264":
+        elif codec == "libx264" and recording.bit_rate is None:
             stream.options = {"crf": str(recording.crf), "preset": "veryfast"}
         else:
-            stream.bit_rate = _FALLBACK_BIT_RATE
+            stream.bit_rate = recording.bit_rate or _FALLBACK_BIT_RATE
         if codec == "libx264":
             stream.options |= self._x264_options()
 
