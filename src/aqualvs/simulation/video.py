@@ -58,12 +58,25 @@ _CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}
 class VideoWriter(Closing):
     """Writer of RGB frames to a video file; use it as a context manager to close the file.
 
-    The suffix of `path` chooses the container. `first_field`: field that comes first in interlaced
-    pictures; None for whole pictures. "h264" codes them as such, with chroma of each field by
-    itself, as capture devices do; the other codecs know no fields.
+    Parameters
+    ----------
+    path : Path
+        File to write; the suffix chooses the container.
+    size_px : (int, int)
+        Width and height of every frame.
+    fps : float
+        Frames a second.
+    first_field : {"top", "bottom"} or None
+        Field that comes first in interlaced pictures: "h264" codes them as such, with chroma of
+        each field by itself, as capture devices do; the other codecs know no fields. None for
+        whole pictures.
 
-    Raises `OptionError` if an option makes no sense, `OutputError` if the file cannot be written or
-    the encoder is missing.
+    Raises
+    ------
+    OptionError
+        If an option makes no sense.
+    OutputError
+        If the file cannot be written or the encoder is missing.
     """
 
     def __init__(
