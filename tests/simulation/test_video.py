@@ -67,17 +67,23 @@ def test_mjpeg_holds_every_frame_as_a_jpeg_in_full_range(tmp_path):
         assert np.abs(error).mean() < 3.0
 
 
-def test_smaller_crf_makes_a_larger_file(tmp_path):
+def test_smaller_crf_or_more_bits_make_a_larger_file(tmp_path):
     rng = np.random.default_rng(0)
     frames = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(4)]
     sizes = {}
-    for name, crf in {"fine": 10, "coarse": 40}.items():
+    for name, options in {
+        "fine": {"crf": 10},
+        "coarse": {"crf": 40},
+        "bits": {"bit_rate": 8_000_000},
+        "few_bits": {"bit_rate": 100_000},
+    }.items():
         path = tmp_path / f"{name}.mp4"
-        with VideoWriter(path, (128, 96), 25.0, Compression(crf=crf)) as writer:
+        with VideoWriter(path, (128, 96), 25.0, Compression(**options)) as writer:
             for frame in frames:
                 writer.write(frame)
         sizes[name] = path.stat().st_size
     assert sizes["fine"] > 2 * sizes["coarse"]
+    assert sizes["bits"] > sizes["few_bits"]
 
 
 def test_the_same_pictures_give_the_same_file(tmp_path):
@@ -108,7 +114,8 @@ def test_an_interrupted_file_can_be_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options", [{"codec": "best"}, {"crf": 60}, {"jpeg_quality": 0}, {"jpeg_quality": 101}]
+    "options",
+    [{"codec": "best"}, {"crf": 60}, {"bit_rate": 0}, {"jpeg_quality": 0}, {"jpeg_quality": 101}],
 )
 def test_senseless_compression_is_refused(options):
     with pytest.raises(OptionError):

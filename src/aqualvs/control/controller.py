@@ -473,7 +473,7 @@ class RangeYawController:
 
 
 class _Slope:
-    """The range's rate: measured, or from differences through a first-order filter."""
+    """Rate of a quantity: measured, or from differences through a first-order filter."""
 
     def __init__(self, time: float) -> None:
         self._time = time

@@ -138,7 +138,7 @@ class Mission(ABC):
 class HoldMission(Mission):
     """Hold a range and yaw, for some time or for good; after that time it holds on.
 
-    `duration`: seconds with the target after which it is `Stage.OVER`.
+    `duration`: seconds with the target after which it is `Stage.OVER`; endless if left out.
     """
 
     sways = False

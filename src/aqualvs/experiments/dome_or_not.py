@@ -71,12 +71,6 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     gains = [refitted[k] / _rms(found, found.dome, k) for k in range(4)]
     worst = float(np.abs(found.percent(found.dome)).max())
     bare = float(np.abs(found.percent(found.bare)).max())
-    tables = {"dome": found.dome, "no_dome": found.bare, "no_dome_refitted": found.refitted}
-    columns = {"true_range_m": found.true} | {
-        f"{way}_{name}_m": table[:, k]
-        for k, name in enumerate((*PICKS, "average"))
-        for way, table in tables.items()
-    }
     return ExperimentResult(
         sentence=f"From {min(PLACES_MM)} to {max(PLACES_MM)} mm and back single points are within "
         f"{worst:.2f} % of the truth with the dome model and within {bare:.1f} % without: "
@@ -128,7 +122,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
                 lambda figure: _draw_errors(figure, found),
             ),
         ),
-        series=(DataColumns(name="dome_or_not", columns=columns),),
+        series=(_series(found),),
         notes=(
             "Without the dome model means as with `aqualvs run --no-dome`: the same lens in the "
             "same position, the same laser planes, and straight rays.",
@@ -217,6 +211,16 @@ def _row(found: Distances, pick: int, name: str) -> ExperimentRow:
         ours=f"{_rms(found, found.dome, pick):.3f}, {_rms(found, found.bare, pick):.2f}; "
         f"{slope:.5f}, {bare:.4f}",
     )
+
+
+def _series(found: Distances) -> DataColumns:
+    tables = {"dome": found.dome, "no_dome": found.bare, "no_dome_refitted": found.refitted}
+    columns = {"true_range_m": found.true} | {
+        f"{way}_{name}_m": table[:, k]
+        for k, name in enumerate((*PICKS, "average"))
+        for way, table in tables.items()
+    }
+    return DataColumns(name="dome_or_not", columns=columns)
 
 
 def _draw_distances(figure: Figure, found: Distances) -> None:

@@ -202,9 +202,6 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
     rms = np.sqrt(np.mean(errors**2, axis=0))
     share = 100.0 * float(valid.mean())
     depth, heading = log.column("depth"), np.unwrap(log.column("heading"))
-    columns = {"time_s": time_s}
-    for k, name in enumerate(("range_m", "pitch_deg", "yaw_deg")):
-        columns |= {f"true_{name}": truth[:, k], name: measured[:, k]}
     return ExperimentResult(
         sentence=f"Sinking from {depth[0]:.1f} to {depth[-1]:.1f} m along a net that moves, range "
         f"is measured within {rms[0]:.2f} % and yaw within {rms[2]:.2f} degrees (rms) in "
@@ -240,7 +237,7 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
                 lambda figure: _draw(figure, log, time_s, measured),
             ),
         ),
-        series=(DataColumns(name="sea", columns=columns),),
+        series=(_sea_series(time_s, measured, truth),),
         notes=(
             "A simulated BlueROV2 in a current of 0.15 m/s and waves of 0.1 m in front of the net "
             "of a cage of 20 m radius that sways and rocks. It is controlled with postures with "
@@ -295,6 +292,13 @@ def _postures(sensor: _PartlyRendered) -> tuple[FloatArray, FloatArray]:
     true = [truth[:3] for _, _, truth in sensor.seen]
     scale = np.array([1.0, 180.0 / math.pi, 180.0 / math.pi])
     return scale * np.array(found), scale * np.array(true)
+
+
+def _sea_series(time_s: FloatArray, measured: FloatArray, truth: FloatArray) -> DataColumns:
+    columns = {"time_s": time_s}
+    for k, name in enumerate(("range_m", "pitch_deg", "yaw_deg")):
+        columns |= {f"true_{name}": truth[:, k], name: measured[:, k]}
+    return DataColumns(name="sea", columns=columns)
 
 
 def _draw(figure: Figure, log: LoopLog, seen_s: FloatArray, measured: FloatArray) -> None:

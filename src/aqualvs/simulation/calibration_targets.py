@@ -63,11 +63,22 @@ def board_on_rail(
 ) -> tuple[list[SE3], list[float]]:
     """Return `dome_from_board` of a board that is carried along the dome's y axis.
 
-    Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted. The
-    second list has the distances along the y axis to each board's plane, in metres.
+    Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted.
 
-    `size`: width and height of the board's squares, in metres. `distances`, shape (N,): of the
-    board's middle, in metres.
+    Parameters
+    ----------
+    size : (float, float)
+        Width and height of the board's squares, in metres.
+    distances : array, shape (N,)
+        Of the board's middle, in metres.
+    rng : Generator
+        Random number generator.
+
+    Returns
+    -------
+    poses : list of SE3
+    measured : list of float
+        Distance along the y axis to each board's plane, in metres.
     """
     poses, measured = [], []
     for k, distance in enumerate(distances):

@@ -56,7 +56,7 @@ def write_vehicle_log(scenario: Scenario, path: Path) -> None:
     """Write depth and attitude of the vehicle, ten times a second, with the noise of sensors.
 
     The scenario has a net or a wall as its target; the CSV file has `LOG_COLUMNS`, on its own clock
-    (`LEAD_S`).
+    (`LEAD_S`). Raises `OSError` if it cannot be written.
     """
     rng = np.random.default_rng([scenario.seed, 23])
     rate_hz = 10.0
@@ -76,7 +76,8 @@ def write_hole_truth(scenario: Scenario, path: Path) -> None:
     """Write the places of the holes in a scenario's nets as a CSV file with `HOLE_COLUMNS`.
 
     These are right and up of the vehicle's foot on the net in the first frame, diameter, depth and
-    bearing, and the time at which the vehicle's foot is nearest.
+    bearing, and the time at which the vehicle's foot is nearest. Raises `OSError` if the file
+    cannot be written.
     """
     times = np.array(list(scenario.times()))
     feet = np.array([_foot(scenario, t) for t in times])

@@ -341,10 +341,16 @@ def add_colour(seen: Vec, light: float, sheets: Sheets, i: int) -> Vec:
 
 
 def light_on_points(points: FloatArray, sheets: Sheets, attenuation: Vec) -> FloatArray:
-    """Return the laser light (n, 3) on free-floating points (n, 3) in `dome`, in metres.
+    """Return the laser light on free-floating points, shape (n, 3) in, (n, 3) out.
 
-    `sheets`: with the distances at which surfaces end them. `attenuation`: of the water per metre,
-    for red, green and blue.
+    Parameters
+    ----------
+    points : array, shape (n, 3)
+        In `dome`, in metres.
+    sheets : Sheets
+        With the distances at which surfaces end them.
+    attenuation : (float, float, float)
+        Of the water per metre, for red, green and blue.
     """
     light = np.zeros((len(points), 3))
     _light_on_points(np.ascontiguousarray(points), sheets, attenuation, light)

@@ -119,9 +119,20 @@ class NetWall:
         leaves the cylinder by u⁴/(8 R³) at a distance u, and its mesh is stretched by u³/(6 R²).
         The stains on a wall behind a curved net move with the vehicle.
 
-        `base`: in the frame of the net at rest; holes and folds of nets are placed along it and up.
-        Its `dome_from_scene` is not used. Render the scene at the same time. Raises `OptionError`
-        if a net of `base` is bent by itself, or has edges while this wall is curved.
+        Parameters
+        ----------
+        world_from_dome : SE3
+            Pose of the dome's axes.
+        time_s : float
+            Time in seconds; render the scene at the same.
+        base : Scene
+            Scene in the frame of the net at rest; holes and folds of nets are placed along it and
+            up. Its `dome_from_scene` is not used.
+
+        Raises
+        ------
+        OptionError
+            If a net of `base` is bent by itself, or has edges while this wall is curved.
         """
         self._check(base.nets)
         dome_from_net = world_from_dome.inverse() @ self.world_from_net(time_s)
@@ -154,9 +165,21 @@ class NetWall:
     ) -> SE3:
         """Return world_from_dome of a level dome at a distance and yaw before a place on the net.
 
-        `distance`: from the nearest point, which is at `along` and `up`, in metres. `yaw`: as
-        `Posture.yaw`, in radians. Raises `OptionError` if the distance is not positive, or reaches
-        the axis of a cage from inside.
+        Parameters
+        ----------
+        distance : float
+            From the nearest point, in metres.
+        along, up : float
+            Place of that point on the net, in metres.
+        yaw : float
+            As `Posture.yaw`, in radians.
+        time_s : float
+            Time in seconds.
+
+        Raises
+        ------
+        OptionError
+            If the distance is not positive, or reaches the axis of a cage from inside.
         """
         if not distance > 0.0 or distance * self.curvature <= -1.0:
             raise OptionError(

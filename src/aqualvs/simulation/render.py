@@ -228,9 +228,16 @@ class Renderer:
         """Return the picture with its middle at time `t`, as the rig's shutter takes it.
 
         Truth and marine snow are those of the middle. Each field of an interlaced picture has its
-        own blur and noise, as if the other one did not exist. Without `rng` there is no noise.
+        own blur and noise, as if the other one did not exist.
 
-        `scene_at`: the scene at any time from the first row to the last.
+        Parameters
+        ----------
+        scene_at : callable
+            Scene at any time from the first row to the last.
+        t : float
+            In seconds.
+        rng : Generator, optional
+            Without it the picture has no noise.
         """
         scene, shutter = scene_at(t), self.rig.shutter
         if shutter.instant:
@@ -286,13 +293,22 @@ class Renderer:
     def radiance(
         self, scene: Scene, t: float = 0.0, where: BoolArray | None = None
     ) -> NDArray[np.float32]:
-        """Return the radiance (height, width, 3) at the lens, before blur, noise and saturation.
+        """Return the radiance at the lens at time `t`, before blur, noise and saturation.
 
-        It is red, green, blue; 1 is the sensor's full scale at gain 1. Zero where the lens model or
-        the housing lets no light through.
+        Parameters
+        ----------
+        scene : Scene
+            At time `t`.
+        t : float
+            In seconds.
+        where : bool array, shape (height, width), optional
+            Pixels to be traced; others may lack all light except that of marine snow.
 
-        `where`, shape (height, width): pixels to be traced; others may lack all light except that
-        of marine snow.
+        Returns
+        -------
+        radiance : float32 array, shape (height, width, 3)
+            Red, green, blue; 1 is the sensor's full scale at gain 1. Zero where the lens model
+            or the housing lets no light through.
         """
         return self._radiance(scene, t, *self._pack(scene, t), where)
 

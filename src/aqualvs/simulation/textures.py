@@ -160,9 +160,9 @@ def charuco_texture(board: CharucoPrint) -> Texture:
 def marker_texture(ground: FloatArray, cell: float, prints: MarkerPrint) -> Texture:
     """Return a ground with markers on it, each in a ring of white paper.
 
-    `ground`, shape (rows, columns): albedo under the markers. `cell`: side of a cell, in metres.
-    Raises `OptionError` if a marker's side is no multiple of its cells, or it does not lie on the
-    ground.
+    `ground`, shape (rows, columns): albedo under the markers; not changed. `cell`: side of a cell,
+    in metres. Raises `OptionError` if a marker's side is no multiple of its cells, or it does not
+    lie on the ground.
     """
     book = _dictionary(prints.dictionary)
     n_cells = book.markerSize + 2 * _FRAME
@@ -185,8 +185,18 @@ def mottled(
 ) -> FloatArray:
     """Return the albedo (rows, columns) of an uneven ground, such as concrete or plywood.
 
-    `albedo`: mean. `contrast`: half the spread over the mean. `scale`: cells over which a texel of
-    the noise is stretched. `shift`: offset in the noise, so that panels differ.
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    albedo : float
+        Mean.
+    contrast : float
+        Half the spread over the mean.
+    scale : float
+        Cells over which a texel of the noise is stretched.
+    shift : int
+        Offset in the noise, so that panels differ.
     """
     tile = noise_tiles().smooth
     rows, columns = (((np.arange(n) / scale).astype(int) + shift) % len(tile) for n in shape)

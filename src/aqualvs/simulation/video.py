@@ -31,8 +31,9 @@ class Compression:
     # lossless H.264 in RGB; or every frame as a separate JPEG (4:2:0, full range), as from USB
     # cameras.
     codec: Codec = "h264"
-    # Quality of "h264", 0 to 51; smaller is better.
+    # Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
     crf: int = 20
+    bit_rate: int | None = None  # Bits a second of "h264".
     jpeg_quality: int = 80  # Of "mjpeg", 1 to 100; larger is better.
 
     def __post_init__(self) -> None:
@@ -40,6 +41,8 @@ class Compression:
             raise OptionError(f"codec is {self.codec!r}; choose h264, lossless or mjpeg")
         if not 0 <= self.crf <= 51:
             raise OptionError(f"crf is {self.crf}; it must lie between 0 and 51")
+        if self.bit_rate is not None and self.bit_rate <= 0:
+            raise OptionError(f"bit rate is {self.bit_rate}; it must be positive")
         if not 1 <= self.jpeg_quality <= 100:
             raise OptionError(f"JPEG quality is {self.jpeg_quality}; it must lie between 1 and 100")
 
@@ -55,12 +58,25 @@ _CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}
 class VideoWriter(Closing):
     """Writer of RGB frames to a video file; use it as a context manager to close the file.
 
-    The suffix of `path` chooses the container. `first_field`: field that comes first in interlaced
-    pictures; None for whole pictures. "h264" codes them as such, with chroma of each field by
-    itself, as capture devices do; the other codecs know no fields.
+    Parameters
+    ----------
+    path : Path
+        File to write; the suffix chooses the container.
+    size_px : (int, int)
+        Width and height of every frame.
+    fps : float
+        Frames a second.
+    first_field : {"top", "bottom"} or None
+        Field that comes first in interlaced pictures: "h264" codes them as such, with chroma of
+        each field by itself, as capture devices do; the other codecs know no fields. None for
+        whole pictures.
 
-    Raises `OptionError` if an option makes no sense, `OutputError` if the file cannot be written or
-    the encoder is missing.
+    Raises
+    ------
+    OptionError
+        If an option makes no sense.
+    OutputError
+        If the file cannot be written or the encoder is missing.
     """
 
     def __init__(
@@ -92,10 +108,10 @@ class VideoWriter(Closing):
         elif codec == "libx264rgb":
             stream.pix_fmt = "rgb24"
             stream.options = {"qp": "0", "preset": "veryfast"}
-        elif codec == "libx264":
+        elif codec == "libx264" and recording.bit_rate is None:
             stream.options = {"crf": str(recording.crf), "preset": "veryfast"}
         else:
-            stream.bit_rate = _FALLBACK_BIT_RATE
+            stream.bit_rate = recording.bit_rate or _FALLBACK_BIT_RATE
         if codec == "libx264":
             stream.options |= self._x264_options()
 

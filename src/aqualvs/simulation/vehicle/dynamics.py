@@ -397,9 +397,16 @@ def fly(
 ) -> None:
     """Advance the vehicle by `n` steps of `h` seconds under one effort.
 
-    `y`, shape (13,): state, see the docstring of this module. `thrusts`, shape (n_thrusters,): in
-    newtons. `memory`, shape (N_MEMORY,): of the autopilot. `effort`, shape (4,): request of the
-    sticks; see `StickInput.asked`.
+    Parameters
+    ----------
+    y : array, shape (13,)
+        State, see the docstring of this module.
+    thrusts : array, shape (n_thrusters,)
+        In newtons.
+    memory : array, shape (N_MEMORY,)
+        Of the autopilot.
+    effort : array, shape (4,)
+        Request of the sticks; see `StickInput.asked`.
     """
     for i in range(n):
         steer(y, effort, h, memory, pilot)

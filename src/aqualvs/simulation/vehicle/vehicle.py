@@ -139,11 +139,30 @@ class SimulatedVehicle:
     """Simulated vehicle under a pilot's sticks.
 
     The world is north, east, down from the still surface; the body forward, right, down. The same
-    model, water, sticks and `rng`, the source of the sensors' noise, give the same dive.
+    model, water, sticks and `rng` give the same dive.
 
-    `world_from_body`: initial pose, at rest; it holds this heading and depth. `latency`: delay of
-    stick positions, in seconds. `lapse`: time after the last ones until it holds still, in seconds
-    (FS_PILOT_TIMEOUT).
+    Parameters
+    ----------
+    model : VehicleModel
+        Hull, thrusters and autopilot.
+    water : WaterMotion
+        Current, waves and tether.
+    rng : Generator
+        Source of the sensors' noise.
+    world_from_body : SE3
+        Initial pose, at rest; it holds this heading and depth.
+    sensors : Sensors, optional
+        Errors of its sensors.
+    latency : float
+        Delay of stick positions, in seconds.
+    lapse : float
+        Time after the last ones until it holds still, in seconds (FS_PILOT_TIMEOUT).
+
+    Attributes
+    ----------
+    armed, obeys : bool
+        Disarmed, its thrusters stand still; if it does not obey, it holds heading and depth and
+        ignores the sticks. Both may be set, as by a pilot.
     """
 
     def __init__(
@@ -164,8 +183,6 @@ class SimulatedVehicle:
             )
         self.model, self.water = model, water
         self.latency, self.lapse = latency, lapse
-        # Disarmed, its thrusters stand still; if it does not obey, it holds heading and depth and
-        # ignores the sticks. Both may be set, as by a pilot.
         self.armed, self.obeys = True, True
         self._body, self._pilot = pack_body(model), pack_pilot(model)
         self._idle = self._pilot._replace(curve=np.array([0.0, 0.0, 0.0, 1.0]))
