@@ -22,7 +22,8 @@ from aqualvs.recording.encoding import TOPICS
 from aqualvs.recording.messages import stripes_message, stripes_of
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.scan import GyroRates
+from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.scanning.scan import GyroRates, Scan, ScanPoints
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.target import TargetKind
 from live_cases import demo_rig, demo_samples
@@ -218,9 +219,8 @@ def test_frames_that_were_lost_stay_lost(demo, tmp_path):
     again(demo / "dive.mp4", tmp_path / "video", demo / "rig.yaml", frames=FEW, mcap=True)
     recording = DiveRecording(tmp_path / "video" / "dive.mcap")
     assert recording.n_frames == 12
-    from aqualvs.workers.run_frames import _lost
-
-    lost = replace(samples[1], scan=_lost(1, 0.04, 1.3333), peaks={}, frame=None)
+    scan = Scan(1, 0.04, Refusal(Reason.CORRUPT_FRAME), ScanPoints.none(), 1.3333)
+    lost = replace(samples[1], scan=scan, peaks={}, frame=None)
     kept = Recording(path, RecorderOptions())
     for sample in (samples[0], lost, samples[2]):
         kept.write(sample)

@@ -80,11 +80,7 @@ def batch(request: BatchRequest, echo: Echo) -> int:
             found = Scheduler(sized, workers, progress).run(lambda: stop.caught is not None)
         records = _all_records(out, found)
         with writing(out):
-            # What processes left that were killed.
-            for path in list((out / HOME).rglob("*.part")):
-                clear(path)
-                if path.is_file():
-                    path.unlink(missing_ok=True)
+            _tidy(out / HOME)
             (out / DATASET).mkdir(exist_ok=True)
             write_dives(out / DATASET, [record.row() for record in records])
         for line in _summary_lines(out, found, stop.caught.name if stop.caught else ""):
@@ -164,6 +160,14 @@ def _with_moved(known: dict[str, str], dives: Sequence[Dive], out: Path) -> dict
 def _finished(out: Path, name: str) -> dict[str, Any] | None:
     """Return the manifest of a dive whose pieces are joined; None of any other."""
     return read_manifest(out / HOME / DIVES / name / JOINED)
+
+
+def _tidy(home: Path) -> None:
+    """Remove what processes left that were killed."""
+    for path in list(home.rglob("*.part")):
+        clear(path)
+        if path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]:

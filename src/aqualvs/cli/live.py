@@ -103,7 +103,7 @@ def live(
         Literal["tcp", "udp"] | None, Option(help="Transport of RTSP; tcp by default.")
     ] = None,
     target: Target = "auto",
-    detector: Annotated[Literal["ridge", "threshold"], Option(help="Stripe detector.")] = ("ridge"),
+    detector: Annotated[Literal["ridge", "threshold"], Option(help="Stripe detector.")] = "ridge",
     water_n: WaterIndex = None,
     temperature_c: Celsius = None,
     salinity: Salinity = None,

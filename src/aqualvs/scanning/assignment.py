@@ -161,8 +161,9 @@ NOT_TESTED = AssignmentOutcome(Verdict.CLEAR)
 class AssignmentTest:
     """Tests surfaces of one rig against rival assignments.
 
-    Its methods judge one surface, `target`, of a frame. `linked` are the frame's candidates,
-    `surfaces` all surfaces found in it: light on the others is no evidence against the target.
+    Its methods judge one surface, `target`, of a frame. `linked` are the frame's candidates with
+    their `subsegments`, `surfaces` all surfaces found in it: light on the others is no evidence
+    against the target.
 
     Parameters
     ----------
@@ -283,11 +284,8 @@ class AssignmentTest:
         """
         if target.is_mesh or any(one.plane.offset > target.plane.offset for one in surfaces):
             return False
-        candidates, rows, n_lines = (
-            linked.candidates,
-            linked.subsegments.of_candidate,
-            linked.shapes.n_lines,
-        )
+        candidates, subsegments, shapes = linked
+        rows, n_lines = subsegments.of_candidate, shapes.n_lines
         share = loose_share_before(
             candidates,
             rows,
