@@ -113,7 +113,7 @@ def start_row(name: str, ours: Sequence[str], plain: Sequence[str], rounds: int)
 def start_rows(rounds: int, *, with_imports: bool) -> list[dict[str, Any]]:
     demo = [str(bundled_dive() / name) for name in ("dive.mp4", "rig.yaml")]
     imports = {
-        "aqualvs.optics.camera": "numpy, numba",
+        "aqualvs.optics": "numpy, numba",
         "aqualvs.scanner": "numpy, numba, cv2",
         "aqualvs.pipeline": "numpy, numba, cv2, av, pydantic, yaml",
         "aqualvs.run_outputs": "numpy, numba, cv2, av, pydantic, yaml, pyarrow",

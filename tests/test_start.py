@@ -3,6 +3,7 @@
 import gc
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -61,11 +62,12 @@ def test_a_slow_first_frame_is_explained(terminal: bool, monkeypatch, capsys) ->
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr("aqualvs.terminal._SLOW_S", 0.0)
-    said = ""
+    said, until_s = "", time.monotonic() + 30.0
     with progress("dive", 2) as tick:
-        while FIRST_RUN not in said:
+        while FIRST_RUN not in said and time.monotonic() < until_s:
             said += capsys.readouterr().err
         tick(1)
+    assert FIRST_RUN in said
     monkeypatch.setattr("aqualvs.terminal._SLOW_S", 60.0)
     with progress("dive", 2) as tick:
         tick(1)
