@@ -22,6 +22,7 @@ from aqualvs.simulation.cameras import CAMERAS
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import list_scenarios
 from aqualvs.sources import open_source
+from complaints import complaints
 from panel_cases import small_rig
 from shell_cases import rig_file
 from waiting import TIMEOUT_S, until
@@ -121,7 +122,7 @@ def interrupted(begun, *arguments):
     process.send_signal(signal.SIGINT)
     said, errors = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 128 + signal.SIGINT, errors
-    assert errors == ""
+    assert complaints(errors) == []
     return said
 
 
