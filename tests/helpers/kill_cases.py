@@ -168,7 +168,7 @@ def _call_here(*arguments: object) -> subprocess.CompletedProcess[str]:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(words)
-    errors = "".join(f"{line}\n" for line in complaints(err.getvalue()))
+    errors = "".join(complaints(err.getvalue()))
     return subprocess.CompletedProcess(words, code, out.getvalue(), errors)
 
 
