@@ -177,6 +177,10 @@ def test_index_sigma_is_that_of_a_monte_carlo() -> None:
         (pinhole(), "There are no lasers"),
         (pinhole(upright(), level(0.9)), "'level' never crosses the picture between 300 and 1200"),
         (
+            pinhole(upright(), Laser("beside", Plane.from_normal([1.0, -3.0, 0.0], 5e-3))),
+            "'beside' never crosses the picture",
+        ),
+        (
             pinhole(upright(), Laser("twin", Plane.from_normal([-1, 0, 0], -0.1))),
             "lie in one plane",
         ),
@@ -195,7 +199,15 @@ def test_index_sigma_is_that_of_a_monte_carlo() -> None:
             "looks 180 degrees away",
         ),
     ],
-    ids=["no lasers", "laser unseen", "coplanar", "metres", "no water", "backwards"],
+    ids=[
+        "no lasers",
+        "laser unseen",
+        "unseen without depth",
+        "coplanar",
+        "metres",
+        "no water",
+        "backwards",
+    ],
 )
 def test_what_makes_a_rig_useless(rig: Rig, words: str) -> None:
     assert words in sentences(check_rig(rig), Severity.BAD)

@@ -391,23 +391,24 @@ def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
             "One laser draws one line on a target: points, but no pitch and yaw; add a second."
         )
     for laser in rig.lasers:
-        yield _check_laser(rig, camera, laser)
+        yield from _check_laser(rig, camera, laser)
 
 
-def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
-    """Return a finding on where a laser's stripe is visible within the working range."""
+def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Iterator[Finding]:
+    """Yield findings on how a laser's stripe moves with range, and where it is visible."""
     near, far = rig.working_range
     # Least distance of the plane from the lens, in metres: nearer, one pixel is hundreds of
     # millimetres of range at 0.6 m.
     least_baseline, small_baseline = 1e-3, 10e-3
     baseline = abs(float(laser.plane.normal @ rig.dome_from_cam.translation) - laser.plane.offset)
     if baseline < least_baseline:
-        return Finding.bad(
+        yield Finding.bad(
             f"Laser '{laser.name}' passes the lens at {baseline * 1e3:.2g} mm, so that its stripe "
             "does not move with range; offset_mm is in millimetres."
         )
+        return
     if baseline < small_baseline:
-        return Finding.warn(
+        yield Finding.warn(
             f"Laser '{laser.name}' passes the lens at {baseline * 1e3:.2g} mm, so that its stripe "
             "hardly moves with range; turn its line across the way from the lens to the laser."
         )
@@ -417,19 +418,21 @@ def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     views = [visible_stripe(camera, sheet, float(wall)) for wall in walls]
     seen = np.array([view.visible for view in views])
     if not seen.any():
-        return Finding.bad(
+        yield Finding.bad(
             f"Laser '{laser.name}' never crosses the picture between {near * 1e3:.0f} and "
             f"{far * 1e3:.0f} mm; check the sign of its offset_mm and its normal."
         )
+        return
     picked = [i for i in (0, n_ranges // 2, n_ranges - 1) if seen[i]] or [int(np.argmax(seen))]
     places = ", ".join(_place(float(walls[i]), views[i]) for i in picked)
     if seen.all():
-        return Finding.ok(f"Laser '{laser.name}' crosses the picture {places}.")
-    return Finding.warn(
-        f"Laser '{laser.name}' is in the picture only from {walls[seen][0] * 1e3:.0f} to "
-        f"{walls[seen][-1] * 1e3:.0f} mm of the working range {near * 1e3:.0f} to "
-        f"{far * 1e3:.0f} mm: {places}."
-    )
+        yield Finding.ok(f"Laser '{laser.name}' crosses the picture {places}.")
+    else:
+        yield Finding.warn(
+            f"Laser '{laser.name}' is in the picture only from {walls[seen][0] * 1e3:.0f} to "
+            f"{walls[seen][-1] * 1e3:.0f} mm of the working range {near * 1e3:.0f} to "
+            f"{far * 1e3:.0f} mm: {places}."
+        )
 
 
 def _place(wall: float, view: StripeView) -> str:
