@@ -59,6 +59,8 @@ class StopSignals(Closing):
 
 
 Tick: TypeAlias = Callable[[int], None]
+_Shown: TypeAlias = tuple[Tick, Callable[[], None]]
+"""What is to be called with the number of frames done, and to say why the first takes long."""
 
 FIRST_RUN = "the first run on a machine compiles, which takes about a minute"
 """Said if the first frame takes long; compiled code is kept for the next run."""
@@ -91,22 +93,17 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
     if _HIDDEN.get():
         yield lambda _: None
         return
-    if not _may_be_terminal():
-        units = unit.removesuffix("s") if n_frames == 1 else unit
-        count = unit if n_frames is None else f"{n_frames} {units}"
-        _say(f"{label}: {count}")
-        lines = Lines(label, count if n_frames is None else f"of {count}")
-        with _called_if_slow(lambda: _say(f"{label}: {FIRST_RUN}"), _SLOW_S) as timer:
+    shown = _bar if _may_be_terminal() else _lines
+    with (
+        shown(label, n_frames, unit) as (tick, explain),
+        _called_if_slow(explain, _SLOW_S) as timer,
+    ):
 
-            def tick_line(n_done: int) -> None:
-                timer.cancel()
-                lines.tick(n_done)
+        def count(n_done: int) -> None:
+            timer.cancel()
+            tick(n_done)
 
-            yield tick_line
-        return
-
-    with _bar(label, n_frames, unit) as tick:
-        yield tick
+        yield count
 
 
 class Lines:
@@ -165,7 +162,17 @@ def _may_be_terminal() -> bool:
 
 
 @contextlib.contextmanager
-def _bar(label: str, n_frames: int | None, unit: str) -> Iterator[Tick]:
+def _lines(label: str, n_frames: int | None, unit: str) -> Iterator[_Shown]:
+    """Print lines."""
+    units = unit.removesuffix("s") if n_frames == 1 else unit
+    count = unit if n_frames is None else f"{n_frames} {units}"
+    _say(f"{label}: {count}")
+    lines = Lines(label, count if n_frames is None else f"of {count}")
+    yield lines.tick, lambda: _say(f"{label}: {FIRST_RUN}")
+
+
+@contextlib.contextmanager
+def _bar(label: str, n_frames: int | None, unit: str) -> Iterator[_Shown]:
     """Show a bar; nothing where Rich does not take standard error for a terminal."""
     from rich import console, progress
 
@@ -182,17 +189,11 @@ def _bar(label: str, n_frames: int | None, unit: str) -> Iterator[Tick]:
     ) as bar:
         task = bar.add_task(label, total=n_frames, rate="")
 
-        def explain() -> None:
-            bar.update(task, description=f"{label} ({FIRST_RUN})")
+        def tick(n_done: int) -> None:
+            bar.update(task, advance=n_done, description=label)
+            bar.update(task, rate=rate_text(bar.tasks[0], unit))
 
-        with _called_if_slow(explain, _SLOW_S) as timer:
-
-            def tick(n_done: int) -> None:
-                timer.cancel()
-                bar.update(task, advance=n_done, description=label)
-                bar.update(task, rate=rate_text(bar.tasks[0], unit))
-
-            yield tick
+        yield tick, lambda: bar.update(task, description=f"{label} ({FIRST_RUN})")
 
 
 def rate_text(task: "Task", unit: str) -> str:

@@ -7,7 +7,7 @@ rules as a table.
 
 import math
 from collections import deque
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple, Self
 
@@ -57,7 +57,7 @@ class LimitReason(StrEnum):
     @property
     def takes_over(self) -> bool:
         """Whether the pilot must engage again before efforts pass."""
-        return self not in _PASSING | _STEERS
+        return not (self in _PASSING or self.steers)
 
     @property
     def steers(self) -> bool:
@@ -314,4 +314,9 @@ def _backing(effort: Effort, least: float) -> Effort:
 
 
 def _clipped(effort: Effort) -> Effort:
-    return Effort(**{name: clipped(part) for name, part in asdict(effort).items()})
+    return Effort(
+        forward=clipped(effort.forward),
+        right=clipped(effort.right),
+        down=clipped(effort.down),
+        yaw=clipped(effort.yaw),
+    )

@@ -294,9 +294,14 @@ class _InnerKernel(_Kernel):
     def _for_python(self) -> Callable[..., Any]:
         # Numba names cache files by qualified name: under the same one, a process could load the
         # code without a wrapper for Python, and crash.
-        function: Any = self.py_func
-        names = ("code", "globals", "name", "defaults", "closure")
-        own = types.FunctionType(*(getattr(function, f"__{name}__") for name in names))
+        function = self.py_func
+        own = types.FunctionType(
+            function.__code__,
+            function.__globals__,
+            function.__name__,
+            function.__defaults__,
+            function.__closure__,
+        )
         functools.update_wrapper(own, function)
         own.__qualname__ += "_for_python"
         return _compiled(own, **self._options)

@@ -207,9 +207,18 @@ class Scenario:
 
     def scene_at(self, t: float) -> Scene:
         """Return the scene before the vehicle at time `t`; render it at the same `t`."""
-        shared = [name for name in Scene.__slots__ if name != "dome_from_scene"]
-        content = {name: getattr(self, name) for name in shared}
-        return Scene(dome_from_scene=self.trajectory.pose_at(t, self.duration), **content)
+        return Scene(
+            dome_from_scene=self.trajectory.pose_at(t, self.duration),
+            walls=self.walls,
+            nets=self.nets,
+            fish=self.fish,
+            bubbles=self.bubbles,
+            boxes=self.boxes,
+            target=self.target,
+            water=self.water,
+            sensor=self.sensor,
+            lasers_on=self.lasers_on,
+        )
 
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -338,7 +338,7 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
         found,
         start_utc_s=utc,
         start_utc_sigma_s=None if utc is None else utc_sigma_s,
-        sources={} if utc is None else {"start_utc_s": utc_from},
+        utc_source="" if utc is None else utc_from,
         notes=tuple(n for n in (*damage, stuck) if n),
     )
 

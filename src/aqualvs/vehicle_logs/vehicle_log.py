@@ -185,13 +185,30 @@ class VehicleLog:
 
 
 def log_of(
-    path: Path, kind: str, found: Mapping[str, tuple[Signal | None, str]], **others: Any
+    path: Path,
+    kind: str,
+    found: Mapping[str, tuple[Signal | None, str]],
+    *,
+    start_utc_s: float | None,
+    start_utc_sigma_s: float | None,
+    notes: tuple[str, ...],
+    utc_source: str = "",
 ) -> VehicleLog:
-    """Return the log of signals with their sources, by name; `others`: its further fields."""
+    """Return the log of signals with their sources, by name; `utc_source` is that of its UTC."""
     known = {name: pair for name, pair in found.items() if pair[0] is not None}
     signals: dict[str, Any] = {name: signal for name, (signal, _) in known.items()}
-    sources = {name: source for name, (_, source) in known.items()} | others.pop("sources", {})
-    return VehicleLog(name=str(path), kind=kind, sources=sources, **signals, **others)
+    sources = {name: source for name, (_, source) in known.items()}
+    if utc_source:
+        sources["start_utc_s"] = utc_source
+    return VehicleLog(
+        name=str(path),
+        kind=kind,
+        sources=sources,
+        start_utc_s=start_utc_s,
+        start_utc_sigma_s=start_utc_sigma_s,
+        notes=notes,
+        **signals,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -185,8 +185,8 @@ class PeerTable:
     def rival(self) -> str:
         """Other address that speaks as the vehicle; empty if there is none."""
         since_s = time.monotonic() - _CLAIM_LIFETIME_S
-        vehicle = self.vehicle
         with self._lock:
+            vehicle = self._homes.get(self._system, (None, 0.0))[0]
             found = [peer for peer, (_, at_s) in self._rivals.items() if at_s > since_s]
         if vehicle is None or not found:
             return ""
@@ -277,13 +277,15 @@ class PeerTable:
     def _remember(self, peer: Peer, parser: Any) -> None:
         """Store the parser of an address, and send to it; strangers never replace known senders."""
         now_s = time.monotonic()
+        if peer in self._senders:
+            self._senders[peer] = parser, now_s
+            return
         vehicle = self.vehicle
         with self._lock:
-            for other, (_, heard_s) in list(self._senders.items()):
-                if other != peer and now_s - heard_s > _HEARD_S:
-                    del self._senders[other]
+            for other in [p for p, (_, s) in self._senders.items() if now_s - s > _HEARD_S]:
+                del self._senders[other]
             others = len(self._senders) - (vehicle in self._senders)
-            if peer in self._senders or peer == vehicle or others < _MAX_OTHERS:
+            if peer == vehicle or others < _MAX_OTHERS:
                 self._senders[peer] = parser, now_s
 
 
