@@ -5,6 +5,7 @@ scatter in space, right ones share a plane. Planes are found one after another; 
 explains are not available to the next, whichever laser they were assigned to.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -96,7 +97,38 @@ def search_surfaces(
     if found == 0 or found == MAX_SURFACES:
         return found
     plane, mine = planes[found], members[found]
-    return found + _find_before(search, free, planes[0], plane, mine, sums[found])
+    # The search that ended may have left marks.
+    mine[:] = False
+    # More subsegments than this are specks.
+    most = 500
+    return found + _find_before(search, free, planes[0], most, plane, mine, sums[found])
+
+
+@lazy_kernel
+def search_before(
+    search: SurfaceSearch,
+    others: BoolArray,
+    behind: FloatArray,
+    plane: FloatArray,
+    members: BoolArray,
+    sums: FloatArray,
+) -> bool:
+    """Find a plane with most of the light in front of another one that no surface explains.
+
+    Parameters
+    ----------
+    search : SurfaceSearch
+    others : bool array, shape (C,)
+        Subsegments on any surface.
+    behind : array, shape (4,)
+        Normal and offset of the other plane.
+    plane, members, sums
+        Written: one row each of what `search_surfaces` writes; `members` is False at first.
+    """
+    cell, free = np.empty(search.pixels.shape[0], np.int64), np.full(others.shape[0], True)
+    n_cells, n_columns = number_cells(search.pixels, cell)
+    _claim_peaks(search.subsegments.of_candidate, cell, n_cells, n_columns, others, free)
+    return bool(_find_before(search, free, behind, free.shape[0], plane, members, sums))
 
 
 @inner_kernel
@@ -104,21 +136,20 @@ def _find_before(
     search: SurfaceSearch,
     free: BoolArray,
     behind: FloatArray,
+    most: int,
     plane: FloatArray,
     members: BoolArray,
     sums: FloatArray,
 ) -> bool:
     """Find a plane with most of the free light in front of another one, `behind` (4,).
 
-    A coarse net is lit in few places: a small share of the light on the wall behind it.
+    A coarse net is lit in few places: a small share of the light on the wall behind it. It is
+    looked for among at most `most` subsegments.
     """
     subsegments = search.subsegments
-    # The search that ended may have left marks.
-    members[:] = False
     before, weight = _mark_before(subsegments, behind, free), subsegments.table[WEIGHT]
     rows = flatnonzero(before)
-    # Numbers of subsegments among which a net is looked for: more are specks.
-    fewest, most = 6, 500
+    fewest = 6
     if not fewest <= rows.shape[0] <= most:
         return False
     if not _find_plane(search, weight, rows, ZERO + 1, plane):
@@ -444,6 +475,46 @@ def find_surfaces(
         for one in surfaces
     ]
     return _merge_coplanar(classified, subsegments)
+
+
+def find_before(
+    target: Surface,
+    surfaces: Sequence[Surface],
+    subsegments: Subsegments,
+    pixels: FloatArray,
+    n_lasers: int,
+    working_range: tuple[float, float],
+    focal_px: float,
+) -> Surface | None:
+    """Find a surface in front of another one that has most of the light left there.
+
+    A peak has a candidate for each laser of a fan, so that a net before a wall has a small share of
+    all candidates, and is found only once the wall's peaks are set aside.
+
+    Parameters
+    ----------
+    target : Surface
+        The surface behind.
+    surfaces : sequence of Surface
+        All surfaces found; their light is set aside.
+    subsegments, pixels, n_lasers, working_range, focal_px
+        As in `find_surfaces`.
+
+    Returns
+    -------
+    Surface or None
+        None unless it has a twentieth of the light of the surface behind.
+    """
+    # Specks before a wall make planes by chance, with little light.
+    least_share = 0.05
+    search = SurfaceSearch(subsegments, pixels, n_lasers, *working_range)
+    plane, members, sums = np.empty(4), np.zeros(subsegments.n, np.bool_), np.zeros(3)
+    others = np.any([one.members for one in surfaces], axis=0)
+    if not search_before(search, others, target.plane.packed(), plane, members, sums):
+        return None
+    if sums[INLIER_WEIGHT] < least_share * target.inlier_weight:
+        return None
+    return _describe(subsegments, plane, members, sums, n_lasers, focal_px)
 
 
 def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: float) -> Surface:

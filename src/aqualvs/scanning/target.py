@@ -11,12 +11,14 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, AssignmentTest, Verdict
 from aqualvs.scanning.candidates import Candidates, LinkedCandidates, Subsegments
+from aqualvs.scanning.laser_bands import search_range
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, Measurement
 from aqualvs.scanning.surfaces import (
     MIN_LINES_PER_LASER,
     WORTH_SHARE,
     Surface,
+    find_before,
     left_over,
     shares_peaks,
     surface_on,
@@ -271,10 +273,30 @@ class TargetSelector:
         nearer = None
         if self._kind is TargetKind.AUTO:
             nearer = self._assignment.overlooked(linked, surfaces, target)
+            if nearer is None and self._assignment.fans and not target.is_mesh:
+                surfaces, nearer = self._net_before(linked, surfaces, target)
         if nearer is not None and nearer.is_mesh:
             surfaces, target, nearer = _with_replaced(surfaces, nearer), nearer, None
         outcome = self._assignment.test(linked, target)
         return TargetChoice(surfaces, target, nearer, outcome)
+
+    def _net_before(
+        self, linked: LinkedCandidates, surfaces: list[Surface], target: Surface
+    ) -> tuple[list[Surface], Surface | None]:
+        """Search once more for a net before the target; return it, and the surfaces with it."""
+        before = find_before(
+            target,
+            surfaces,
+            linked.subsegments,
+            linked.candidates.pixels,
+            self._n_lasers,
+            search_range(self._working_range),
+            self._focal_px,
+        )
+        if before is None:
+            return surfaces, None
+        nearer = self._assignment.overlooked(linked, [*surfaces, before], target)
+        return (surfaces, None) if nearer is None else ([*surfaces, before], nearer)
 
     def _best_target(
         self, subsegments: Subsegments, surfaces: list[Surface]
