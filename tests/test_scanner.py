@@ -24,6 +24,7 @@ from aqualvs.scanning.stripe import ThresholdOptions, flank_difference
 from aqualvs.scanning.surfaces import Surface, find_surfaces
 from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
+from fan_cases import Fan, fan_rig
 from scanning_cases import merged, peaks_of
 from scanning_cases import strands as broken
 from windowed_cases import windowed
@@ -265,6 +266,26 @@ def test_a_net_before_a_wall_is_the_target_unless_the_wall_is_asked_for() -> Non
     assert np.mean(found.points.label[on_net & ~on_wall] == Label.NET) > 0.98
     # Fragments of strands and crossings are left out of the posture.
     assert np.mean(found.points.used[on_net & ~on_wall]) > 0.3
+
+
+def with_fan(rig: Rig, fan: Fan) -> Rig:
+    """The rig with the lines of a fan in place of its lasers."""
+    return replace(rig, lasers=fan_rig(fan).lasers)
+
+
+FANS = [
+    Fan(n_lines=9, spacing_deg=1.9, baseline=(-0.12, 0.0, 0.0), aim_deg=8.0),
+    Fan(n_lines=14, spacing_deg=1.1, baseline=(-0.15, 0.02, 0.0), aim_deg=8.0),
+]
+
+
+@pytest.mark.parametrize("fan", FANS, ids=["9 lines", "14 lines"])
+@pytest.mark.parametrize("wall", [plane(0.95, 0.0, -4.0), plane(1.15, 3.0, 6.0)], ids=str)
+def test_a_net_before_a_wall_under_many_lasers(fan: Fan, wall: Plane) -> None:
+    # A peak has a candidate for most lasers: the net has a small share of all candidates.
+    rig, net = with_fan(bluerov2_rig(), fan), plane(0.55, 3.0, 2.0)
+    found = scan([(net, thin_strands), (wall, everywhere)], rig=rig, lasers=range(fan.n_lines))
+    assert_posture(found.posture, net, share=0.004, deg=1.0)
 
 
 @pytest.mark.parametrize(

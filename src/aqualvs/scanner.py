@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from aqualvs.errors import FrameError, OptionError
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
@@ -282,21 +282,24 @@ class Scanner:
         target = targets.accept(linked, choice, has_colour=has_colour)
         if isinstance(target, Refusal):
             return Measurement.refused(target, linked.candidates.n)
-        found = inflate_for_rival(self._fit_posture(linked, target), choice.tested)
+        explained = targets.explained(linked, choice.surfaces, target)
+        found = inflate_for_rival(self._fit_posture(linked, target, explained), choice.tested)
         # The mean plane of folds covers all of a net's light, nearer parts included.
         nearer = None if found.folded else targets.contradiction(linked, choice.surfaces, target)
         if nearer is None or not found.posture:
             return found
         return Measurement.refused(nearer, linked.candidates.n)
 
-    def _fit_posture(self, linked: LinkedCandidates, target: Surface) -> Measurement:
+    def _fit_posture(
+        self, linked: LinkedCandidates, target: Surface, explained: BoolArray | None
+    ) -> Measurement:
         """Return the posture to the target, as the rows of the picture show it."""
         candidates, subsegments, _ = linked
         if self._row_motion is None:
-            return self._posture_estimator.measure(candidates, subsegments, target)
+            return self._posture_estimator.measure(candidates, subsegments, target, explained)
         on_target = target.members[subsegments.of_candidate]
         still = self._row_motion.stilled(candidates, on_target, target.plane)
-        found = self._posture_estimator.measure(still, subsegments, target)
+        found = self._posture_estimator.measure(still, subsegments, target, explained)
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return found

@@ -227,6 +227,10 @@ class AssignmentTest:
         is_even = n_even >= few and faint <= _ODDS.may_be_faint
         return is_even and share >= _ODDS.certain_share and visible >= least
 
+    def is_even(self, subsegments: Subsegments, surface: Surface) -> bool:
+        """Return whether a surface shows most of the lasers that should be visible on it."""
+        return not self._is_faint(surface, subsegments)
+
     def fills_lines(self, subsegments: Subsegments, surface: Surface) -> bool:
         """Return whether a surface shows as much of its best stripe as something solid.
 

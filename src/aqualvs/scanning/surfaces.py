@@ -20,7 +20,7 @@ from aqualvs.geometry.compiled import (
     lazy_borrowing_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import flatnonzero, sum_of
+from aqualvs.geometry.linear_algebra import flatnonzero, n_bins, sum_of
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments, mark_cells, number_cells
 from aqualvs.scanning.net_surfaces import (
@@ -482,8 +482,8 @@ def find_before(
     surfaces: Sequence[Surface],
     subsegments: Subsegments,
     pixels: FloatArray,
-    n_lasers: int,
     working_range: tuple[float, float],
+    n_lasers: int,
     focal_px: float,
 ) -> Surface | None:
     """Find a surface in front of another one that has most of the light left there.
@@ -497,7 +497,7 @@ def find_before(
         The surface behind.
     surfaces : sequence of Surface
         All surfaces found; their light is set aside.
-    subsegments, pixels, n_lasers, working_range, focal_px
+    subsegments, pixels, working_range, n_lasers, focal_px
         As in `find_surfaces`.
 
     Returns
@@ -561,6 +561,31 @@ def shares_peaks(one: Surface, other: Surface, subsegments: Subsegments) -> bool
     """Return whether most search lines of a surface are on another one as well."""
     shared = subsegments.n_lines[one.members & other.members].sum()
     return bool(shared > _MAX_SHARED * subsegments.n_lines[one.members].sum())
+
+
+def explained_by_others(
+    source: IntArray, of_candidate: IntArray, surfaces: Sequence[Surface], target: Surface
+) -> BoolArray | None:
+    """Return the candidates whose peaks lie on other surfaces only; None without others.
+
+    Parameters
+    ----------
+    source : int array, shape (N,)
+        Number of each candidate's peak.
+    of_candidate : int array, shape (N,)
+        Row of each one's subsegment.
+    surfaces : sequence of Surface
+        All surfaces of the frame.
+    target : Surface
+        The surface whose peaks are left out.
+    """
+    others = [one.members for one in surfaces if one.members is not target.members]
+    if not others:
+        return None
+    peaks = np.zeros(n_bins(source), np.bool_)
+    peaks[source[np.any(others, axis=0)[of_candidate]]] = True
+    peaks[source[target.members[of_candidate]]] = False
+    return peaks[source]
 
 
 def _describe(

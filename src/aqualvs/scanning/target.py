@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from aqualvs.geometry.arrays import BoolArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, AssignmentTest, Verdict
@@ -18,6 +19,7 @@ from aqualvs.scanning.surfaces import (
     MIN_LINES_PER_LASER,
     WORTH_SHARE,
     Surface,
+    explained_by_others,
     find_before,
     left_over,
     shares_peaks,
@@ -228,6 +230,18 @@ class TargetSelector:
         nearer = self._assignment.nearer_net(linked.subsegments, surfaces, target)
         return None if nearer is None else _ambiguous(target.plane, nearer.plane)
 
+    def explained(
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
+    ) -> BoolArray | None:
+        """Return the candidates (N,) that are no folds of a net, because others explain them.
+
+        None unless a peak has many candidates, some of which lie beside any surface.
+        """
+        if not target.is_mesh:
+            return None
+        candidates, rows = linked.candidates, linked.subsegments.of_candidate
+        return explained_by_others(candidates.source, rows, surfaces, target)
+
     def as_other_kind(
         self, linked: LinkedCandidates, choice: TargetChoice, found: Measurement
     ) -> TargetChoice | None:
@@ -268,35 +282,39 @@ class TargetSelector:
 
     def _choose_once(self, linked: LinkedCandidates, surfaces: list[Surface]) -> TargetChoice:
         surfaces, target = self._best_target(linked.subsegments, surfaces)
+        nearer = None
+        if target is not None and self._kind is TargetKind.AUTO:
+            nearer = self._assignment.overlooked(linked, surfaces, target)
+            if nearer is None and self._assignment.fans:
+                surfaces, target = self._with_net_before(linked, surfaces, target)
         if target is None:
             return TargetChoice(surfaces)
-        nearer = None
-        if self._kind is TargetKind.AUTO:
-            nearer = self._assignment.overlooked(linked, surfaces, target)
-            if nearer is None and self._assignment.fans and not target.is_mesh:
-                surfaces, nearer = self._net_before(linked, surfaces, target)
         if nearer is not None and nearer.is_mesh:
             surfaces, target, nearer = _with_replaced(surfaces, nearer), nearer, None
         outcome = self._assignment.test(linked, target)
         return TargetChoice(surfaces, target, nearer, outcome)
 
-    def _net_before(
+    def _with_net_before(
         self, linked: LinkedCandidates, surfaces: list[Surface], target: Surface
     ) -> tuple[list[Surface], Surface | None]:
-        """Search once more for a net before the target; return it, and the surfaces with it."""
+        """Return the surfaces and the target, with a net that was missed among many lasers.
+
+        It replaces something solid if all light on its plane, also that which the solid surface
+        explains, shows most lasers. False edges make meshes, too, but of few lasers.
+        """
+        subsegments, pixels = linked.subsegments, linked.candidates.pixels
+        of_rig = (self._n_lasers, self._focal_px)
         before = find_before(
-            target,
-            surfaces,
-            linked.subsegments,
-            linked.candidates.pixels,
-            self._n_lasers,
-            search_range(self._working_range),
-            self._focal_px,
+            target, surfaces, subsegments, pixels, search_range(self._working_range), *of_rig
         )
-        if before is None:
-            return surfaces, None
-        nearer = self._assignment.overlooked(linked, [*surfaces, before], target)
-        return (surfaces, None) if nearer is None else ([*surfaces, before], nearer)
+        if before is None or not before.is_mesh:
+            return surfaces, target
+        if target.is_mesh:
+            return self._best_target(subsegments, [*surfaces, before])
+        whole = surface_on(before.plane, subsegments, *of_rig)
+        if not self._assignment.is_even(subsegments, whole):
+            return surfaces, target
+        return [*surfaces, before], before
 
     def _best_target(
         self, subsegments: Subsegments, surfaces: list[Surface]
