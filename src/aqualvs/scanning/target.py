@@ -311,7 +311,10 @@ class TargetSelector:
             return surfaces, target
         if target.is_mesh:
             return self._best_target(subsegments, [*surfaces, before])
-        whole = surface_on(before.plane, subsegments, *of_rig)
+        # Its light may have been read as the next lasers'.
+        verdict, other, _ = self._assignment.test(linked, before)
+        plane = before.plane if other is None or verdict is not Verdict.RIVAL else other
+        whole = surface_on(plane, subsegments, *of_rig)
         if not self._assignment.is_even(subsegments, whole):
             return surfaces, target
         return [*surfaces, before], before
