@@ -167,7 +167,8 @@ class Scanner:
 
         `peaks` are from `detect`, and `scan` is what `measure` makes of them. Returns those of the
         tallest peaks if they give a posture that is certain without colour, and has many more
-        points than any before; else as given.
+        points than any before, or is nearer: a wall may keep its colour behind a net that lost it.
+        Else as given.
         """
         finds_stripes = isinstance(self.options.detector, StripeOptions)
         if not (finds_stripes and _may_lack_colour(peaks, scan)):
@@ -176,8 +177,11 @@ class Scanner:
         tallest = self._search(frame.index).detector.tallest(by_luma)
         again = self.measure(frame.index, frame.time_s, tallest, has_colour=False)
         n_before = scan.posture.n_points if scan.posture else 0
-        many_more = 1.5
-        is_better = again.posture and again.posture.n_points > many_more * n_before
+        many_more, nearer = 1.5, 0.95
+        is_better = again.posture and (
+            again.posture.n_points > many_more * n_before
+            or (scan.posture and again.posture.range < nearer * scan.posture.range)
+        )
         return (tallest, again) if is_better else (peaks, scan)
 
     def detect(self, frame: Frame) -> FramePeaks:
