@@ -1,10 +1,11 @@
 """Random nets, measured and compared with the truth: validity, errors, normalised errors.
 
-    python -m benchmarks.random_nets [N] [--first K] [--pictures FOLDER]
+    python -m benchmarks.random_nets [N] [--first K] [--fans] [--pictures FOLDER]
 
 renders N random scenes (seeds fixed; clean, usual and hard in turn), measures each with the scanner
-and prints one table. With --pictures the rendered planes are kept in a folder and read from there
-the next time, so that another version of the scanner is tried on the same pictures at little cost.
+and prints one table. With --fans each has a rig of its own, with a fan of 4 to 15 lines. With
+--pictures the rendered planes are kept in a folder and read from there the next time, so that
+another version of the scanner is tried on the same pictures at little cost.
 Normalised errors are root mean squares of error over stated sigma; the robust ones are 1.4826 times
 the median of their absolute values.
 """
@@ -16,15 +17,16 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from benchmarks.random_scenes import Difficulty, random_scene
+from benchmarks.random_scenes import Difficulty, random_fan_rig, random_scene
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.scene import SurfaceKind
+from aqualvs.simulation.scene import Scene, SurfaceKind
 from aqualvs.simulation.truth import visible_fit
 
 DIFFICULTIES: tuple[Difficulty, ...] = ("clean", "usual", "hard")
@@ -38,28 +40,32 @@ class Shot(NamedTuple):
     number: int
     frame: Frame
     plane: FloatArray
+    rig: Rig
 
 
-def shots(n: int, first: int, folder: Path | None) -> Iterator[Shot]:
+def shots(n: int, first: int, folder: Path | None, *, fans: bool = False) -> Iterator[Shot]:
     """Yield pictures of random nets, rendered or read."""
     renderer = None
     for index in range(first, first + n):
-        path = None if folder is None else folder / f"{index:04d}.npz"
+        path = None if folder is None else folder / f"{'fan' if fans else ''}{index:04d}.npz"
+        difficulty = DIFFICULTIES[index % 3]
+        rng = np.random.default_rng([77 if fans else 2023, index])
+        rig = random_fan_rig(rng) if fans else example_rig()
         if path is None or not path.exists():
-            renderer = renderer or Renderer(example_rig(), threads=1)
-            luma, u, v, plane = _render(renderer, index)
+            if fans or renderer is None:
+                renderer = Renderer(rig, threads=1)
+            luma, u, v, plane = _render(renderer, random_scene(rng, difficulty), index)
             if path is not None:
                 np.savez_compressed(path, luma=luma, u=u, v=v, plane=plane)
         else:
             with np.load(path) as kept:
                 luma, u, v, plane = (kept[name] for name in ("luma", "u", "v", "plane"))
-        yield Shot(index, Frame(0, 0.0, luma, (u, v)), plane)
+        yield Shot(index, Frame(0, 0.0, luma, (u, v)), plane, rig)
 
 
 def _render(
-    renderer: Renderer, index: int
+    renderer: Renderer, scene: Scene, index: int
 ) -> tuple[ImagePlane, ImagePlane, ImagePlane, FloatArray]:
-    scene = random_scene(np.random.default_rng([2023, index]), DIFFICULTIES[index % 3])
     picture = renderer.render(scene, 0.0, np.random.default_rng([7, index]))
     bgr = cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR).astype(np.uint8, copy=False)
     luma, chroma = planes_of_image(bgr)
@@ -83,16 +89,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("n", type=int, nargs="?", default=102)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--fans", action="store_true")
     parser.add_argument("--pictures", type=Path)
     asked = parser.parse_args()
     if asked.pictures is not None:
         asked.pictures.mkdir(parents=True, exist_ok=True)
-    scanner, found, refused, n_seen = Scanner(example_rig()), [], [], 0
-    for shot in shots(asked.n, asked.first, asked.pictures):
+    found, refused, n_seen = [], [], 0
+    for shot in shots(asked.n, asked.first, asked.pictures, fans=asked.fans):
         if not np.isfinite(shot.plane).all():
             continue
         n_seen += 1
-        posture = scanner.process(shot.frame).posture
+        posture = Scanner(shot.rig).process(shot.frame).posture
         if isinstance(posture, Posture):
             found.append([shot.number, *_errors(posture, shot.plane)])
         else:

@@ -1,11 +1,15 @@
-"""Random scenes of nets, for statistics over conditions rather than over one dive."""
+"""Random scenes of nets, and random fans, for statistics over conditions rather than one dive."""
 
+from dataclasses import replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
 from aqualvs.errors import OptionError
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Laser, Rig
 from aqualvs.simulation.scenario import dome_from_target, random_bubbles, random_fish
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from aqualvs.simulation.scene import Mesh, Net, Scene, Wall, WaterOptics
 
 Difficulty: TypeAlias = Literal["clean", "usual", "hard"]
@@ -57,6 +61,39 @@ def random_scene(rng: np.random.Generator, difficulty: Difficulty = "usual") -> 
         target="net",
         water=_water(rng, difficulty),
     )
+
+
+def random_fan_rig(rng: np.random.Generator) -> Rig:
+    """Return the example rig or the BlueROV2's with a fan in place of its lasers.
+
+    A fan is a laser with a grating: 4 to 15 near-parallel lines, 1 to 4 degrees apart, from one
+    emitter 70 to 200 mm beside the camera, or above or below it in three of ten rigs.
+
+    Parameters
+    ----------
+    rng : Generator
+        Random number generator; the same state gives the same rig.
+    """
+    n = int(rng.integers(4, 16))
+    spacing = np.deg2rad(rng.uniform(1.2, 4.0) if n < 10 else rng.uniform(1.0, 2.5))
+    side = 1 if rng.random() < 0.5 else -1
+    beside = float(rng.uniform(0.07, 0.2)) * side
+    is_upright = rng.random() < 0.7
+    up, ahead = float(rng.uniform(-0.05, 0.05)), float(rng.uniform(-0.03, 0.03))
+    aim, roll = -side * np.deg2rad(rng.uniform(3.0, 14.0)), np.deg2rad(rng.uniform(-8.0, 8.0))
+    emitter = np.array([beside, ahead, up])
+    along = np.array([np.sin(roll), 0.0, np.cos(roll)])
+    lasers = []
+    for i in range(n):
+        angle = aim + np.arcsin((i - 0.5 * (n - 1)) * np.sin(spacing))
+        normal = np.cross([np.sin(angle), np.cos(angle), 0.0], along)
+        normal /= np.linalg.norm(normal)
+        offset = float(normal @ emitter)
+        if not is_upright:
+            normal = np.array([normal[2], normal[1], -normal[0]])
+        lasers.append(Laser(f"line{i}", Plane.from_normal(normal, offset)))
+    rig = bluerov2_rig() if rng.random() < 0.5 else example_rig()
+    return replace(rig, lasers=tuple(lasers))
 
 
 def _net(rng: np.random.Generator, difficulty: str) -> Net:

@@ -21,7 +21,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod, Measurement, PostureEstimator
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
-from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.surfaces import Surface, explained_by_others, find_surfaces
 from aqualvs.scanning.target import TargetChoice, TargetKind, TargetSelector, is_better
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -286,7 +286,10 @@ class Scanner:
         target = targets.accept(linked, choice, has_colour=has_colour)
         if isinstance(target, Refusal):
             return Measurement.refused(target, linked.candidates.n)
-        explained = targets.explained(linked, choice.surfaces, target)
+        source, subsegments = linked.candidates.source, linked.subsegments
+        explained = None
+        if target.is_mesh and targets.has_fan:
+            explained = explained_by_others(source, subsegments, choice.surfaces, target)
         found = inflate_for_rival(self._fit_posture(linked, target, explained), choice.tested)
         # The mean plane of folds covers all of a net's light, nearer parts included.
         nearer = None if found.folded else targets.contradiction(linked, choice.surfaces, target)

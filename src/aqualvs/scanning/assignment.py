@@ -255,10 +255,8 @@ class AssignmentTest:
         the stripes; otherwise it may still be a net.
         """
         subsegments = linked.subsegments
-        # A net's shadows may break a wall's stripes finely. A fan shows nearer meshes as well.
+        # A net's shadows may break a wall's stripes finely.
         broken = target.is_mesh and not target.is_unbroken
-        if broken and self.fans:
-            return None
         for one in surfaces:
             # Only gappy stripes have an extent, but not where a coarse net shows few strands.
             may_be_net = one.is_mesh or (one.extent > 0.0 and not broken)

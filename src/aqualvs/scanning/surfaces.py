@@ -564,28 +564,42 @@ def shares_peaks(one: Surface, other: Surface, subsegments: Subsegments) -> bool
 
 
 def explained_by_others(
-    source: IntArray, of_candidate: IntArray, surfaces: Sequence[Surface], target: Surface
+    source: IntArray, subsegments: Subsegments, surfaces: Sequence[Surface], target: Surface
 ) -> BoolArray | None:
-    """Return the candidates whose peaks lie on other surfaces only; None without others.
+    """Return the candidates of a net's peaks that are on other surfaces, so no folds of it.
 
     Parameters
     ----------
     source : int array, shape (N,)
         Number of each candidate's peak.
-    of_candidate : int array, shape (N,)
-        Row of each one's subsegment.
+    subsegments : Subsegments
+        Of all candidates.
     surfaces : sequence of Surface
         All surfaces of the frame.
     target : Surface
-        The surface whose peaks are left out.
+        The net.
+
+    Returns
+    -------
+    bool array, shape (N,), or None
+        None if no other surface is apart from the net; one that is not may be a fold of it.
     """
-    others = [one.members for one in surfaces if one.members is not target.members]
+    others = [one.members for one in surfaces if _is_apart(one, target, subsegments)]
     if not others:
         return None
-    peaks = np.zeros(n_bins(source), np.bool_)
-    peaks[source[np.any(others, axis=0)[of_candidate]]] = True
-    peaks[source[target.members[of_candidate]]] = False
+    peaks, rows = np.zeros(n_bins(source), np.bool_), subsegments.of_candidate
+    peaks[source[np.any(others, axis=0)[rows]]] = True
+    peaks[source[target.members[rows]]] = False
     return peaks[source]
+
+
+def _is_apart(one: Surface, net: Surface, subsegments: Subsegments) -> bool:
+    """Return whether most of a surface's light is farther from a net's plane than folds reach."""
+    deepest = 0.15  # As a share of the range.
+    table, plane = subsegments.table[:, one.members], net.plane
+    off = np.abs(plane.normal @ table[X : Z + 1] - plane.offset)
+    far = off > deepest * plane.offset
+    return bool(table[WEIGHT, far].sum() > 0.5 * table[WEIGHT].sum())
 
 
 def _describe(

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, AssignmentTest, Verdict
@@ -19,7 +18,6 @@ from aqualvs.scanning.surfaces import (
     MIN_LINES_PER_LASER,
     WORTH_SHARE,
     Surface,
-    explained_by_others,
     find_before,
     left_over,
     shares_peaks,
@@ -153,6 +151,11 @@ class TargetSelector:
         self._working_range = rig.working_range
         self._n_lasers, self._focal_px = len(rig.lasers), rig.focal_px
 
+    @property
+    def has_fan(self) -> bool:
+        """Whether many lasers are near-parallel: one of them places light beside any surface."""
+        return bool(self._assignment.fans)
+
     def choose(self, linked: LinkedCandidates, surfaces: list[Surface]) -> TargetChoice:
         """Choose the target, and test whether other lasers explain its peaks as well.
 
@@ -230,18 +233,6 @@ class TargetSelector:
         nearer = self._assignment.nearer_net(linked.subsegments, surfaces, target)
         return None if nearer is None else _ambiguous(target.plane, nearer.plane)
 
-    def explained(
-        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
-    ) -> BoolArray | None:
-        """Return the candidates (N,) that are no folds of a net, because others explain them.
-
-        None unless a peak has many candidates, some of which lie beside any surface.
-        """
-        if not target.is_mesh:
-            return None
-        candidates, rows = linked.candidates, linked.subsegments.of_candidate
-        return explained_by_others(candidates.source, rows, surfaces, target)
-
     def as_other_kind(
         self, linked: LinkedCandidates, choice: TargetChoice, found: Measurement
     ) -> TargetChoice | None:
@@ -285,7 +276,7 @@ class TargetSelector:
         nearer = None
         if target is not None and self._kind is TargetKind.AUTO:
             nearer = self._assignment.overlooked(linked, surfaces, target)
-            if nearer is None and self._assignment.fans:
+            if nearer is None and self.has_fan:
                 surfaces, target = self._with_net_before(linked, surfaces, target)
         if target is None:
             return TargetChoice(surfaces)
