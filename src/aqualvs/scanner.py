@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from aqualvs.errors import FrameError, OptionError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
@@ -21,7 +21,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod, Measurement, PostureEstimator
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
-from aqualvs.scanning.surfaces import Surface, explained_by_others, find_surfaces
+from aqualvs.scanning.surfaces import Surface, find_surfaces
 from aqualvs.scanning.target import TargetChoice, TargetKind, TargetSelector, is_better
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -286,27 +286,34 @@ class Scanner:
         target = targets.accept(linked, choice, has_colour=has_colour)
         if isinstance(target, Refusal):
             return Measurement.refused(target, linked.candidates.n)
-        source, subsegments = linked.candidates.source, linked.subsegments
-        explained = None
-        if target.is_mesh and targets.has_fan:
-            explained = explained_by_others(source, subsegments, choice.surfaces, target)
-        found = inflate_for_rival(self._fit_posture(linked, target, explained), choice.tested)
+        found = inflate_for_rival(self._fit_target(linked, choice, targets, target), choice.tested)
         # The mean plane of folds covers all of a net's light, nearer parts included.
         nearer = None if found.folded else targets.contradiction(linked, choice.surfaces, target)
         if nearer is None or not found.posture:
             return found
         return Measurement.refused(nearer, linked.candidates.n)
 
-    def _fit_posture(
-        self, linked: LinkedCandidates, target: Surface, explained: BoolArray | None
+    def _fit_target(
+        self,
+        linked: LinkedCandidates,
+        choice: TargetChoice,
+        targets: TargetSelector,
+        target: Surface,
     ) -> Measurement:
+        """Return the posture to the target; what another surface explains is no fold of a net."""
+        free = targets.unexplained(linked, choice.surfaces, target)
+        if free is None:
+            return self._fit_posture(linked, target)
+        return self._fit_posture(linked.where(free), target).among(free)
+
+    def _fit_posture(self, linked: LinkedCandidates, target: Surface) -> Measurement:
         """Return the posture to the target, as the rows of the picture show it."""
         candidates, subsegments, _ = linked
         if self._row_motion is None:
-            return self._posture_estimator.measure(candidates, subsegments, target, explained)
+            return self._posture_estimator.measure(candidates, subsegments, target)
         on_target = target.members[subsegments.of_candidate]
         still = self._row_motion.stilled(candidates, on_target, target.plane)
-        found = self._posture_estimator.measure(still, subsegments, target, explained)
+        found = self._posture_estimator.measure(still, subsegments, target)
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return found

@@ -137,6 +137,12 @@ class LinkedCandidates(NamedTuple):
     subsegments: Subsegments
     shapes: ComponentShapes  # Of the components.
 
+    def where(self, mask: BoolArray) -> "LinkedCandidates":
+        """Return those that a mask (N,) selects; subsegments and components stay as they were."""
+        rows = self.subsegments.of_candidate[mask]
+        subsegments = self.subsegments._replace(of_candidate=rows)
+        return self._replace(candidates=self.candidates.where(mask), subsegments=subsegments)
+
 
 class CandidateTables(NamedTuple):
     """Columns of candidates as kernels write them."""

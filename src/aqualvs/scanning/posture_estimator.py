@@ -9,9 +9,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import lazy_borrowing_kernel
@@ -98,6 +99,9 @@ _EXPECTED, _CONTRADICTS = 3.0, 16.27
 _MIN_OBSERVATIONS = 3
 
 
+S = TypeVar("S", bound=np.generic)
+
+
 class FitMethod(StrEnum):
     """Method of the plane fit to the target's points."""
 
@@ -130,6 +134,18 @@ class Measurement:
         """Return a refusal, without inliers among the candidates."""
         return cls(refusal, np.zeros(n_candidates, np.bool_), net_mask=net_mask)
 
+    def among(self, mask: BoolArray) -> "Measurement":
+        """Return the measurement of the candidates that a mask (M,) selects, among all M."""
+
+        def spread(column: NDArray[S]) -> NDArray[S]:
+            whole = np.zeros(len(mask), column.dtype)
+            whole[mask] = column
+            return whole
+
+        net_mask = None if self.net_mask is None else spread(self.net_mask)
+        weights = None if self.weights is None else spread(self.weights)
+        return replace(self, inliers=spread(self.inliers), net_mask=net_mask, weights=weights)
+
 
 class PostureEstimator:
     """Estimator of postures to surfaces with one rig.
@@ -156,11 +172,7 @@ class PostureEstimator:
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def measure(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        target: Surface,
-        explained: BoolArray | None = None,
+        self, candidates: Candidates, subsegments: Subsegments, target: Surface
     ) -> Measurement:
         """Measure the posture to a surface.
 
@@ -172,8 +184,6 @@ class PostureEstimator:
             Those of the candidates.
         target : Surface
             Surface that the posture is measured to.
-        explained : bool array, shape (N,), optional
-            Candidates whose light another surface explains: they are no folds of a net.
         """
         mesh = target.is_mesh
         candidates = candidates if mesh else candidates.without_pull()
@@ -193,9 +203,9 @@ class PostureEstimator:
         found = flat
         if mesh and self._fit_method is FitMethod.ROBUST:
             if flat is not None:
-                found = self._measure_net(candidates, seen, fit, flat, target, explained)
+                found = self._measure_net(candidates, seen, fit, flat, target)
             else:
-                found = self._measure_folded(candidates, seen, fit, explained)
+                found = self._measure_folded(candidates, seen, fit)
         if found is None:
             detail = "all lasers but one show too little of the target"
             return Measurement.refused(Refusal(Reason.ONE_LASER, detail), candidates.n)
@@ -214,14 +224,14 @@ class PostureEstimator:
         fit: PlaneFit,
         flat: Measurement,
         target: Surface,
-        explained: BoolArray | None,
     ) -> Measurement:
         """Measure the posture to a net, which may bend or fold, and mark its candidates.
 
         `flat` is the posture to the plane that was fitted to the target.
         """
         plane = _plane_of(fit)
-        off = _distances_off(candidates, plane, explained)
+        off = np.empty(candidates.n)
+        distances_off(candidates.points, plane.normal, plane.offset, off)
         few = seen.observations.n < _FEW_STRANDS and has_much_beside(off, MODERATELY_BESIDE)
         bends = target.n_planes > 1 or has_much_beside(off)
         bends = bends or shows_curvature(seen.observations, fit.weights, plane)
@@ -238,13 +248,13 @@ class PostureEstimator:
                 # The nearest point is out of view, or the bend may be due to chance.
                 best = _inflated_by(flat, curved)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
-        net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch, explained)
+        net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
         seen = self._observe_near(candidates, net_mask, off, plane)
         share = _share_on(seen, patch, plane)
         if share < _WHOLE_SHARE:
             is_curved = best is curved
             folded = self._mean_plane_of_folds(
-                candidates, net_mask, seen, share, plane, patch, best, explained
+                candidates, net_mask, seen, share, plane, patch, best
             )
             best = folded or best
             if not best.folded:
@@ -252,24 +262,23 @@ class PostureEstimator:
         return replace(best, net_mask=net_mask)
 
     def _measure_folded(
-        self, candidates: Candidates, seen: Observed, fit: PlaneFit, explained: BoolArray | None
+        self, candidates: Candidates, seen: Observed, fit: PlaneFit
     ) -> Measurement | None:
         """Measure the posture to the mean plane of a net on whose plane only one laser lies.
 
         Such a plane has no fixed angles: the mean plane counts only if every laser confirms it.
         """
         plane = _plane_of(fit)
-        off = _distances_off(candidates, plane, explained)
+        off = np.empty(candidates.n)
+        distances_off(candidates.points, plane.normal, plane.offset, off)
         inliers = (seen.group >= 0) & (fit.weights[seen.group] > 0.0)
         patch = packed_plane(plane)
-        net_mask = self._grow_net_mask(candidates, inliers, plane, patch, explained)
+        net_mask = self._grow_net_mask(candidates, inliers, plane, patch)
         seen = self._observe_near(candidates, net_mask, off, plane)
         share = _share_on(seen, patch, plane)
         if share >= _FOLDED_STRANDS:
             return None
-        folded = self._mean_plane_of_folds(
-            candidates, net_mask, seen, share, plane, patch, None, explained
-        )
+        folded = self._mean_plane_of_folds(candidates, net_mask, seen, share, plane, patch, None)
         if folded is None:
             return None
         for index in range(self._n_lasers):
@@ -279,18 +288,11 @@ class PostureEstimator:
         return replace(folded, net_mask=net_mask)
 
     def _grow_net_mask(
-        self,
-        candidates: Candidates,
-        inliers: BoolArray,
-        plane: Plane,
-        patch: FloatArray,
-        explained: BoolArray | None,
+        self, candidates: Candidates, inliers: BoolArray, plane: Plane, patch: FloatArray
     ) -> BoolArray:
         """Mark the candidates on a net (N,), also where its folds leave the surface."""
         net_mask, height = inliers.copy(), np.empty(candidates.n)
         heights_over(candidates.points, patch, height)
-        if explained is not None:
-            height[explained] = np.inf
         grow_region(
             candidates,
             height,
@@ -309,7 +311,6 @@ class PostureEstimator:
         plane: Plane,
         patch: FloatArray,
         best: Measurement | None,
-        explained: BoolArray | None,
     ) -> Measurement | None:
         """Return the posture to the mean plane if the surface is only one flank of a fold.
 
@@ -329,8 +330,7 @@ class PostureEstimator:
         may_be_flank = share < _FLANK_STRANDS and intensity_share < _FLANK_INTENSITY
         if best and not may_be_flank:
             return self._inflated_by_mean(best, seen, plane, intensity_share)
-        mean = self._mean_plane(candidates, seen, plane)
-        mean = self._reselected(candidates, net_mask, mean, explained)
+        mean = self._reselected(candidates, net_mask, self._mean_plane(candidates, seen, plane))
         if mean is None:
             return None
         if best and intensity_share >= _FOLDED_INTENSITY:
@@ -388,22 +388,19 @@ class PostureEstimator:
         return self._observer.observe(candidates, beside, plane, on_twine=True)
 
     def _reselected(
-        self,
-        candidates: Candidates,
-        net_mask: BoolArray,
-        mean: "_MeanPlane | None",
-        explained: BoolArray | None,
+        self, candidates: Candidates, net_mask: BoolArray, mean: "_MeanPlane | None"
     ) -> "_MeanPlane | None":
         """Fit a mean plane again to the strands around it, until the selection is stable.
 
         The first selection is that around one flank, and holds more strands of that side.
         """
+        off = np.empty(candidates.n)
         max_selections = 5
         for _ in range(max_selections):
             if mean is None or not isinstance(mean.found.posture, Posture):
                 break
             plane = Plane(mean.found.posture.normal_in_dome, mean.found.posture.range)
-            off = _distances_off(candidates, plane, explained)
+            distances_off(candidates.points, plane.normal, plane.offset, off)
             seen = self._observe_near(candidates, net_mask, off, plane)
             if np.array_equal(seen.group >= 0, mean.seen.group >= 0):
                 break
@@ -551,18 +548,6 @@ class _MeanPlane(NamedTuple):
     found: Measurement
     seen: Observed
     share: float
-
-
-def _distances_off(candidates: Candidates, plane: Plane, explained: BoolArray | None) -> FloatArray:
-    """Return the candidates' distances (N,) from a plane, as shares of its offset.
-
-    Those whose light another surface explains are infinitely far.
-    """
-    off = np.empty(candidates.n)
-    distances_off(candidates.points, plane.normal, plane.offset, off)
-    if explained is not None:
-        off[explained] = np.inf
-    return off
 
 
 def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:

@@ -563,10 +563,10 @@ def shares_peaks(one: Surface, other: Surface, subsegments: Subsegments) -> bool
     return bool(shared > _MAX_SHARED * subsegments.n_lines[one.members].sum())
 
 
-def explained_by_others(
+def not_on_others(
     source: IntArray, subsegments: Subsegments, surfaces: Sequence[Surface], target: Surface
 ) -> BoolArray | None:
-    """Return the candidates of a net's peaks that are on other surfaces, so no folds of it.
+    """Mark the candidates of a net's peaks, and of those that are on no other surface.
 
     Parameters
     ----------
@@ -590,7 +590,7 @@ def explained_by_others(
     peaks, rows = np.zeros(n_bins(source), np.bool_), subsegments.of_candidate
     peaks[source[np.any(others, axis=0)[rows]]] = True
     peaks[source[target.members[rows]]] = False
-    return peaks[source]
+    return np.logical_not(peaks[source])
 
 
 def _is_apart(one: Surface, net: Surface, subsegments: Subsegments) -> bool:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from aqualvs.geometry.arrays import BoolArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, AssignmentTest, Verdict
@@ -20,6 +21,7 @@ from aqualvs.scanning.surfaces import (
     Surface,
     find_before,
     left_over,
+    not_on_others,
     shares_peaks,
     surface_on,
 )
@@ -151,11 +153,6 @@ class TargetSelector:
         self._working_range = rig.working_range
         self._n_lasers, self._focal_px = len(rig.lasers), rig.focal_px
 
-    @property
-    def has_fan(self) -> bool:
-        """Whether many lasers are near-parallel: one of them places light beside any surface."""
-        return bool(self._assignment.fans)
-
     def choose(self, linked: LinkedCandidates, surfaces: list[Surface]) -> TargetChoice:
         """Choose the target, and test whether other lasers explain its peaks as well.
 
@@ -233,6 +230,17 @@ class TargetSelector:
         nearer = self._assignment.nearer_net(linked.subsegments, surfaces, target)
         return None if nearer is None else _ambiguous(target.plane, nearer.plane)
 
+    def unexplained(
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
+    ) -> BoolArray | None:
+        """Mark the candidates (N,) that may be folds of a net; None if all may be.
+
+        Of many near-parallel lasers, one places light of any other surface beside the net.
+        """
+        if not (target.is_mesh and self._assignment.fans):
+            return None
+        return not_on_others(linked.candidates.source, linked.subsegments, surfaces, target)
+
     def as_other_kind(
         self, linked: LinkedCandidates, choice: TargetChoice, found: Measurement
     ) -> TargetChoice | None:
@@ -276,7 +284,7 @@ class TargetSelector:
         nearer = None
         if target is not None and self._kind is TargetKind.AUTO:
             nearer = self._assignment.overlooked(linked, surfaces, target)
-            if nearer is None and self.has_fan:
+            if nearer is None and self._assignment.fans:
                 surfaces, target = self._with_net_before(linked, surfaces, target)
         if target is None:
             return TargetChoice(surfaces)
