@@ -100,7 +100,7 @@ def search_surfaces(
     # The search that ended may have left marks.
     mine[:] = False
     # More subsegments than this are specks.
-    most = 500
+    most = ZERO + 500
     return found + _find_before(search, free, planes[0], most, plane, mine, sums[found])
 
 
@@ -503,14 +503,19 @@ def find_before(
     Returns
     -------
     Surface or None
-        None unless it has a twentieth of the light of the surface behind.
+        None unless it has a twentieth of the light of the surface behind, and stripes about as
+        narrow.
     """
-    # Specks before a wall make planes by chance, with little light.
-    least_share = 0.05
+    # Specks before a wall make planes by chance, with little light. Peaks that are this many times
+    # as wide as its stripes are its texture.
+    least_share, widest = 0.05, 2.5
     search = SurfaceSearch(subsegments, pixels, n_lasers, *working_range)
     plane, members, sums = np.empty(4), np.zeros(subsegments.n, np.bool_), np.zeros(3)
     others = np.any([one.members for one in surfaces], axis=0)
     if not search_before(search, others, target.plane.packed(), plane, members, sums):
+        return None
+    width = subsegments.width
+    if np.mean(width[members]) > widest * np.mean(width[target.members]):
         return None
     if sums[INLIER_WEIGHT] < least_share * target.inlier_weight:
         return None
