@@ -21,7 +21,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod, Measurement, PostureEstimator
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
-from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.surfaces import Surface, find_surfaces, not_on_others
 from aqualvs.scanning.target import TargetChoice, TargetKind, TargetSelector, is_better
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -286,25 +286,21 @@ class Scanner:
         target = targets.accept(linked, choice, has_colour=has_colour)
         if isinstance(target, Refusal):
             return Measurement.refused(target, linked.candidates.n)
-        found = inflate_for_rival(self._fit_target(linked, choice, targets, target), choice.tested)
+        free = None
+        if target.is_mesh and targets.has_fan:
+            # One of many lasers places light of any other surface beside the net: no folds of it.
+            source, subsegments = linked.candidates.source, linked.subsegments
+            free = not_on_others(source, subsegments, choice.surfaces, target)
+        if free is None:
+            found = self._fit_posture(linked, target)
+        else:
+            found = self._fit_posture(linked.where(free), target).among(free)
+        found = inflate_for_rival(found, choice.tested)
         # The mean plane of folds covers all of a net's light, nearer parts included.
         nearer = None if found.folded else targets.contradiction(linked, choice.surfaces, target)
         if nearer is None or not found.posture:
             return found
         return Measurement.refused(nearer, linked.candidates.n)
-
-    def _fit_target(
-        self,
-        linked: LinkedCandidates,
-        choice: TargetChoice,
-        targets: TargetSelector,
-        target: Surface,
-    ) -> Measurement:
-        """Return the posture to the target; what another surface explains is no fold of a net."""
-        free = targets.unexplained(linked, choice.surfaces, target)
-        if free is None:
-            return self._fit_posture(linked, target)
-        return self._fit_posture(linked.where(free), target).among(free)
 
     def _fit_posture(self, linked: LinkedCandidates, target: Surface) -> Measurement:
         """Return the posture to the target, as the rows of the picture show it."""

@@ -227,10 +227,6 @@ class AssignmentTest:
         is_even = n_even >= few and faint <= _ODDS.may_be_faint
         return is_even and share >= _ODDS.certain_share and visible >= least
 
-    def is_even(self, subsegments: Subsegments, surface: Surface) -> bool:
-        """Return whether a surface shows most of the lasers that should be visible on it."""
-        return not self._is_faint(surface, subsegments)
-
     def fills_lines(self, subsegments: Subsegments, surface: Surface) -> bool:
         """Return whether a surface shows as much of its best stripe as something solid.
 
@@ -369,7 +365,7 @@ class AssignmentTest:
         if n_lasers == 2:
             return bool(may_be_lit and facing < min(other_facing, _ODDS.steep_of_two))
         is_steep = not target.is_mesh and facing <= _ODDS.steep
-        return bool(may_be_lit or is_steep) and self._is_faint(target, subsegments)
+        return bool(may_be_lit or is_steep) and self.is_faint(target, subsegments)
 
     def may_be_shifted(
         self, subsegments: Subsegments, surfaces: Sequence[Surface], target: Surface
@@ -425,7 +421,7 @@ class AssignmentTest:
         )
         return share
 
-    def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
+    def is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether too many of the lasers that should show a surface are faint on it."""
         return self._visibility(surface, subsegments)[1] > _ODDS.may_be_faint
 
@@ -453,7 +449,7 @@ class AssignmentTest:
             if one is target or not one.is_mesh or one.sampling_weight < target.sampling_weight:
                 continue
             if _is_nearer(one, target, subsegments):
-                return one if self._is_faint(target, subsegments) else None
+                return one if self.is_faint(target, subsegments) else None
         return None
 
     def test(self, linked: LinkedCandidates, target: Surface) -> AssignmentOutcome:

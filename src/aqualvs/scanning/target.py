@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, AssignmentTest, Verdict
@@ -21,7 +20,6 @@ from aqualvs.scanning.surfaces import (
     Surface,
     find_before,
     left_over,
-    not_on_others,
     shares_peaks,
     surface_on,
 )
@@ -151,6 +149,7 @@ class TargetSelector:
     def __init__(self, rig: Rig, kind: TargetKind, assignment: AssignmentTest) -> None:
         self._kind, self._assignment = kind, assignment
         self._working_range = rig.working_range
+        self.has_fan = bool(assignment.fans)
         self._n_lasers, self._focal_px = len(rig.lasers), rig.focal_px
 
     def choose(self, linked: LinkedCandidates, surfaces: list[Surface]) -> TargetChoice:
@@ -230,17 +229,6 @@ class TargetSelector:
         nearer = self._assignment.nearer_net(linked.subsegments, surfaces, target)
         return None if nearer is None else _ambiguous(target.plane, nearer.plane)
 
-    def unexplained(
-        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
-    ) -> BoolArray | None:
-        """Mark the candidates (N,) that may be folds of a net; None if all may be.
-
-        Of many near-parallel lasers, one places light of any other surface beside the net.
-        """
-        if not (target.is_mesh and self._assignment.fans):
-            return None
-        return not_on_others(linked.candidates.source, linked.subsegments, surfaces, target)
-
     def as_other_kind(
         self, linked: LinkedCandidates, choice: TargetChoice, found: Measurement
     ) -> TargetChoice | None:
@@ -284,7 +272,7 @@ class TargetSelector:
         nearer = None
         if target is not None and self._kind is TargetKind.AUTO:
             nearer = self._assignment.overlooked(linked, surfaces, target)
-            if nearer is None and self._assignment.fans:
+            if nearer is None and self.has_fan:
                 surfaces, target = self._with_net_before(linked, surfaces, target)
         if target is None:
             return TargetChoice(surfaces)
@@ -314,7 +302,7 @@ class TargetSelector:
         verdict, other, _ = self._assignment.test(linked, before)
         plane = before.plane if other is None or verdict is not Verdict.RIVAL else other
         whole = surface_on(plane, subsegments, *of_rig)
-        if not self._assignment.is_even(subsegments, whole):
+        if self._assignment.is_faint(whole, subsegments):
             return surfaces, target
         return [*surfaces, before], before
 
