@@ -91,18 +91,16 @@ def test_a_recorded_run_replays_bit_for_bit(whole, tmp_path):
 def test_stripes_of_recordings_before_pulls_were_measured_have_none():
     (sample,) = demo_samples(1)
     message = stripes_message(sample, 0)
-    *_, peaks, _, _ = stripes_of(message)
+    peaks = stripes_of(message).peaks
     pulls = {axis: found.pull for axis, found in sample.peaks.items()}
     assert len(peaks) == 2
     for axis, found in peaks.items():
         np.testing.assert_array_equal(found.pull, pulls[axis])
         assert np.count_nonzero(found.pull) > 0.5 * found.n
     # Their number, aligned to 8 bytes, the numbers, and no gyros (4 bytes).
-    *_, old, _, turning = stripes_of(
-        message[: -8 * (1 + sum(found.n for found in peaks.values())) - 4]
-    )
-    assert turning is None
-    for axis, found in old.items():
+    old = stripes_of(message[: -8 * (1 + sum(found.n for found in peaks.values())) - 4])
+    assert old.turning is None
+    for axis, found in old.peaks.items():
         np.testing.assert_array_equal(found.position, peaks[axis].position)
         np.testing.assert_array_equal(found.pull, np.zeros(found.n))
 

@@ -43,9 +43,12 @@ from aqualvs.yamlfile import rig_text
 
 FRAME_ID = "dome"
 _STATES = {State.OFF: 0, State.OK: 1, State.WARN: 2, State.FAULT: 3}
-_FLOATS = ("x", "y", "z", "quality")
-_BYTES = ("intensity", "laser", "label", "used")
-_POINT = np.dtype([*((name, "<f4") for name in _FLOATS), *((name, "u1") for name in _BYTES)])
+_POINT = np.dtype(
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "quality")),
+        *((name, "u1") for name in ("intensity", "laser", "label", "used")),
+    ]
+)
 
 
 def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
@@ -91,10 +94,23 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
     return to.finish()
 
 
-def stripes_of(
-    message: bytes,
-) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None, GyroRates | None]:
-    """Return frame number, time, index of the water, stripes, refusal and gyro rates of a message.
+@dataclass(frozen=True, slots=True)
+class RecordedFrame:
+    """Frame of a recording."""
+
+    # As in `Frame`.
+    index: int
+    time_s: float
+
+    n_water: float  # Refractive index of the water used for this frame.
+    peaks: dict[SearchAxis, StripePeaks]  # Detected stripes.
+    refusal: Refusal | None  # Reason if the frame was not measured; None if it was.
+    turning: GyroRates | None  # Rates by the vehicle's gyros, if known.
+    picture: Frame | None = None  # None if there is none, or pictures are not decoded.
+
+
+def stripes_of(message: bytes) -> RecordedFrame:
+    """Return the frame of a message, without its picture.
 
     Raises `ValueError` if the message is not from `stripes_message`.
     """
@@ -121,7 +137,7 @@ def stripes_of(
     gyros = np.empty(0) if of.at_end else of.array("f8")
     turning = GyroRates(gyros[:3], float(gyros[3])) if len(gyros) == 4 else None
     refusal = Refusal(Reason(reason), detail) if reason else None
-    return index, time_s, n_water, peaks, refusal, turning
+    return RecordedFrame(index, time_s, n_water, peaks, refusal, turning)
 
 
 def points_message(points: ScanPoints, stamp_ns: int) -> bytes:
@@ -133,13 +149,12 @@ def points_message(points: ScanPoints, stamp_ns: int) -> bytes:
     cloud["laser"], cloud["label"], cloud["used"] = points.laser, points.label, points.used
     to = CdrWriter()
     to.header(stamp_ns, FRAME_ID)
-    to.numbers("I", 1, len(points), len(_FLOATS) + len(_BYTES))
+    to.numbers("I", 1, len(points), len(_POINT.names or ()))
     float32, uint8 = 7, 2
-    for i, name in enumerate(_FLOATS + _BYTES):
-        is_float = i < len(_FLOATS)
+    for name, (dtype, offset, *_) in (_POINT.fields or {}).items():
         to.text(name)
-        to.numbers("I", 4 * i if is_float else 3 * len(_FLOATS) + i)
-        to.numbers("B", float32 if is_float else uint8)
+        to.numbers("I", offset)
+        to.numbers("B", float32 if dtype.kind == "f" else uint8)
         to.numbers("I", 1)
     to.numbers("?", False)
     to.numbers("I", _POINT.itemsize, cloud.nbytes)

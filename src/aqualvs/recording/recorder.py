@@ -148,7 +148,7 @@ class Recorder:
         self._changed = threading.Condition()
         self._waiting: deque[tuple[ChunkBuilder, int]] = deque()
         self._waiting_bytes = 0
-        self._n_samples = self._n_dropped = 0
+        self._n_dropped = 0
         self._fault = ""
         self._closing = False
         self._began_s = self._chunk_s = self._synced_s = time.monotonic()
@@ -160,7 +160,6 @@ class Recorder:
         with self._changed:
             if self._closing:
                 return
-            self._n_samples += 1
             if self._chunks.add(sample):
                 self._enqueue_chunk()
 

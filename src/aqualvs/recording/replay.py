@@ -3,7 +3,7 @@
 import functools
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from aqualvs.errors import AqualvsError, SourceError
@@ -17,28 +17,10 @@ from aqualvs.recording.encoding import (
     options_from_text,
     rig_from_record,
 )
-from aqualvs.recording.messages import image_of, rig_texts_of, stripes_of
+from aqualvs.recording.messages import RecordedFrame, image_of, rig_texts_of, stripes_of
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.laser_bands import SearchAxis
-from aqualvs.scanning.posture import Refusal
-from aqualvs.scanning.scan import Frame, GyroRates
-from aqualvs.scanning.stripe import StripePeaks
+from aqualvs.scanning.scan import Frame
 from aqualvs.sources.mcap_file import McapFile, StoredMessage
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedFrame:
-    """Frame of a recording."""
-
-    # As in `Frame`.
-    index: int
-    time_s: float
-
-    n_water: float  # Refractive index of the water used for this frame.
-    peaks: dict[SearchAxis, StripePeaks]  # Detected stripes.
-    refusal: Refusal | None  # Reason if the frame was not measured; None if it was.
-    turning: GyroRates | None  # Rates by the vehicle's gyros, if known.
-    picture: Frame | None  # None if there is none, or pictures are not decoded.
 
 
 class DiveRecording:
@@ -120,16 +102,14 @@ class DiveRecording:
                 parts = {}
 
     def _frame(self, parts: dict[str, StoredMessage]) -> RecordedFrame:
-        stripes = parts[STRIPES.name]
         try:
-            index, time_s, n_water, peaks, refusal, turning = stripes_of(stripes.data)
-            picture = _picture(index, time_s, parts)
+            frame = stripes_of(parts[STRIPES.name].data)
+            return replace(frame, picture=_picture(frame.index, frame.time_s, parts))
         except (ValueError, AqualvsError) as fault:
             raise SourceError(
                 f"{self.path}: a message cannot be understood ({fault}); "
                 "was it written by a later version?"
             ) from fault
-        return RecordedFrame(index, time_s, n_water, peaks, refusal, turning, picture)
 
 
 def is_recording(path: Path) -> bool:
@@ -148,8 +128,7 @@ def _picture(index: int, time_s: float, parts: dict[str, StoredMessage]) -> Fram
     stamp_ns = parts[STRIPES.name].log_ns
     if picture is None or picture.log_ns != stamp_ns:
         return None
-    kind, data = image_of(picture.data)
     own_chroma = None
     if chroma is not None and chroma.log_ns == stamp_ns:
         own_chroma = image_of(chroma.data)[1]
-    return frame_of(index, time_s, kind, data, own_chroma)
+    return frame_of(index, time_s, *image_of(picture.data), own_chroma)
