@@ -205,16 +205,9 @@ def make_runner(
 ) -> LiveRunner:
     """Make the live loop; if a part fails, the parts made before it are closed.
 
-    Parameters
-    ----------
-    provider : callable
-        Makes the provider of the scanner, after everything else.
-    holder : SetpointHolder
-        Where the page puts what is to be held.
-    first : iterable of Output
-        Outputs before all others; taken once the source is open.
-    vehicle : callable, optional
-        As `Page.serve` takes it; by default of the first output that an autopilot answers.
+    `provider`: makes the provider of the scanner, after everything else. `holder`: where the page
+    puts what is to be held. `first`: outputs before all others; taken once the source is open.
+    `vehicle`: as `Page.serve` takes it; by default of the first output that an autopilot answers.
     """
     sys.setswitchinterval(SWITCH_S)
     options = RecorderOptions(

@@ -115,11 +115,7 @@ class FrozenPicture:
     def update(self, time_s: float, luma: ImagePlane) -> float:
         """Return for how long the picture has stood still at most, in seconds; 0 for a live one.
 
-        Parameters
-        ----------
-        time_s : float
-            By the stream's clock.
-        luma : uint8 array, shape (height, width)
+        `time_s`: by the stream's clock.
         """
         cells, reduced = _cell_means(luma), _reduced(luma)
         height, width = luma.shape

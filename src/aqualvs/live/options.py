@@ -121,22 +121,12 @@ def output_makers(
 ) -> Iterator[Callable[[], Output]]:
     """Yield what makes the outputs that were asked for; only these are imported.
 
-    Parameters
-    ----------
-    mavlink, json : sequence of str
-        Addresses; one connection, and one receiver, for each.
-    link : LinkOptions
-        Of every MAVLink connection.
-    foxglove : str or None
-        Address HOST:PORT to listen on.
-    rerun : str or None
-        As `RerunOutput` takes it.
+    `mavlink`, `json`: addresses; one connection, and one receiver, for each. `link`: of every
+    MAVLink connection. `foxglove`: address HOST:PORT to listen on. `rerun`: as `RerunOutput` takes
+    it.
 
-    Raises
-    ------
-    OptionError
-        If an address cannot be understood; and from what makes an output, if the extra that it
-        needs is not installed.
+    Raises `OptionError` if an address cannot be understood; and from what makes an output, if the
+    extra that it needs is not installed.
     """
     for url in mavlink:
         from aqualvs.live.outputs.mavlink import MavlinkOutput
@@ -195,20 +185,11 @@ class Page:
     def of(cls, address: str, token: str | None, embedders: Sequence[str] = ()) -> "Page":
         """Return the page that the command line asks for.
 
-        Parameters
-        ----------
-        address : str
-            HOST:PORT.
-        token : str or None
-            Its password; a new one if left out.
-        embedders : sequence of str, optional
-            Origins, such as `http://blueos.local`, whose pages may show this one; none if left out.
+        `address`: HOST:PORT. `token`: its password; a new one if None. `embedders`: origins, such
+        as `http://blueos.local`, whose pages may show this one.
 
-        Raises
-        ------
-        OptionError
-            If a part is not installed, the token is too short, an embedder is no origin, or the
-            address makes no sense.
+        Raises `OptionError` if a part is not installed, the token is too short, an embedder is no
+        origin, or the address makes no sense.
         """
         try:
             # The server needs all of the extra.
@@ -231,19 +212,11 @@ class Page:
     ) -> Output:
         """Serve the page and print its address.
 
-        Parameters
-        ----------
-        holder : SetpointHolder
-            Where the page puts what is to be held.
-        recorder : RecorderSwitch or None
-            What its record button moves; without one the button refuses.
-        vehicle : callable
-            Returns what the autopilot tells of depth and heading.
+        `holder`: where the page puts what is to be held. `recorder`: what its record button moves;
+        without one the button refuses. `vehicle`: returns what the autopilot tells of depth and
+        heading.
 
-        Raises
-        ------
-        OptionError
-            If the address cannot be used.
+        Raises `OptionError` if the address cannot be used.
         """
         from aqualvs.live.dashboard.access import Controls, RecordButton
         from aqualvs.live.dashboard.server import Dashboard, DashboardServer

@@ -119,19 +119,9 @@ def rig_exact(rig: Rig) -> str:
 def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
     """Return the rig of a recording, to the last bit.
 
-    Parameters
-    ----------
-    text, exact : str
-        Text of the rig file, and that of `rig_exact`.
-    source_name : str
-        Name of the recording in messages.
-
-    Raises
-    ------
-    RigError
-        If the text is no rig file.
-    ValueError
-        If the numbers do not match it.
+    `text`, `exact`: text of the rig file, and that of `rig_exact`. `source_name`: name of the
+    recording in messages. Raises `RigError` if the text is no rig file. Raises `ValueError` if the
+    numbers do not match it.
     """
     content = parse_yaml(text, source_name, RigError)
     rig = rig_from_mapping(content, source_name=source_name, need_lasers=False)

@@ -126,12 +126,8 @@ class GrowingFile:
     Every method raises `OSError` if the system refuses a write. The file is then as before the
     call, which may be repeated.
 
-    Parameters
-    ----------
-    path : Path
-        The file appears there as soon as it is readable. `FileExistsError` if it exists.
-    open_file : callable, optional
-        Opens a path for unbuffered reading and writing; for tests.
+    `path`: the file appears there as soon as it is readable; `FileExistsError` if it exists.
+    `open_file`: opens a path for unbuffered reading and writing; for tests.
     """
 
     def __init__(self, path: Path, open_file: Callable[[Path], BinaryIO] | None = None) -> None:

@@ -196,12 +196,8 @@ class RerunLog(Closing):
 def plane_sigma(posture: Posture, places: FloatArray) -> FloatArray:
     """Return the standard deviation (N,) of points of the target along its normal, in metres.
 
-    Parameters
-    ----------
-    posture : Posture
-        Posture with its total covariance.
-    places : array, shape (N, 2)
-        Points on the target, in metres to the right and up from the foot of the perpendicular.
+    `places`, shape (N, 2): points on the target, in metres to the right and up from the foot of the
+    perpendicular. The covariance is the posture's total one.
     """
     normal, axes = posture.normal_in_dome, upright_axes(posture.normal_in_dome)
     steep = np.array([math.tan(posture.yaw), 1.0, math.tan(posture.pitch)])

@@ -144,26 +144,13 @@ class MavlinkLink:
     ) -> bool:
         """Send messages together, in one datagram where there are datagrams; never waits.
 
-        Parameters
-        ----------
-        *messages
-            pymavlink's message objects, made from `dialect`; may be changed and sent again.
-        urgent : bool
-            On a serial line, may be delayed a little where others are dropped.
-        to_vehicle : bool
-            To the vehicle alone, also where others are heard.
-        packer : object, optional
-            From `make_packer`, to send in another name than the own.
+        `messages`: pymavlink's message objects, made from `dialect`; may be changed and sent again.
+        `urgent`: on a serial line, may be delayed a little where others are dropped. `to_vehicle`:
+        to the vehicle alone, also where others are heard. `packer`: from `make_packer`, to send in
+        another name than the own.
 
-        Returns
-        -------
-        sent : bool
-            False if there is no connection, nobody to send to, or no room; they are dropped then.
-
-        Raises
-        ------
-        struct.error
-            If a field does not fit into its type.
+        Returns False if there is no connection, nobody to send to, or no room; they are dropped
+        then. Raises `struct.error` if a field does not fit into its type.
         """
         timeout_s = _URGENT_TIMEOUT_S if urgent else _TIMEOUT_S
         with self._sending:

@@ -141,14 +141,8 @@ class _Claim(NamedTuple):
 class PeerTable:
     """Table of the senders on a connection, kept apart by address.
 
-    Parameters
-    ----------
-    make_parser : callable
-        Returns a new parser of pymavlink.
-    errors : tuple of exception types
-        Those that a parser raises for bad data.
-    system : int
-        System id of the vehicle.
+    `make_parser`: returns a new parser of pymavlink. `errors`: those that a parser raises for bad
+    data. `system`: system id of the vehicle.
     """
 
     def __init__(

@@ -130,15 +130,11 @@ class _Link(NamedTuple):
 class DdsOutput(Output):
     """Publisher of ROS 2 topics, whether ROS 2 is installed or not.
 
-    Raises `OptionError` if cyclonedds or rosbags is not installed, or the domain is none.
+    `domain_id`: None for `ROS_DOMAIN_ID`, 0 where that is not set. `distro`: release of ROS 2 of
+    the subscribers, such as `humble`: `Range` has changed; None for `ROS_DISTRO`, Jazzy where that
+    is not set.
 
-    Parameters
-    ----------
-    domain_id : int or None
-        None for `ROS_DOMAIN_ID`, 0 where that is not set.
-    distro : str or None
-        Release of ROS 2 of the subscribers, such as `humble`: `Range` has changed. None for
-        `ROS_DISTRO`, Jazzy where that is not set.
+    Raises `OptionError` if cyclonedds or rosbags is not installed, or the domain is none.
     """
 
     name = "ros2"
