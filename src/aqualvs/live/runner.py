@@ -108,7 +108,7 @@ class OutputWorker:
     """
 
     def __init__(self, output: Output) -> None:
-        self._output = output
+        self._output, self.name = output, output.name
         self._fault = ""
         self._n_dropped = 0
         self._waiting: deque[LiveSample] = deque()
@@ -119,11 +119,6 @@ class OutputWorker:
         if not output.inline:
             self._thread = threading.Thread(target=self._run, name=output.name, daemon=True)
             self._thread.start()
-
-    @property
-    def name(self) -> str:
-        """Name of the output."""
-        return self._output.name
 
     def offer(self, sample: LiveSample) -> None:
         """Pass a sample on; return at once."""
@@ -339,22 +334,9 @@ class LiveOptions:
 class LiveRunner:
     """Live loop: measures a feed as it comes and passes the results to the outputs.
 
-    Parameters
-    ----------
-    feed : Feed
-    provider : ScannerProvider
-        Closed at the end.
-    outputs : sequence of Output
-        Closed at the end.
-    posture_filter : PostureFilter or None
-        Smooths over time, in addition to the raw values.
-
-    Attributes
-    ----------
-    n_measured, n_postures : int
-        Frames measured until now; those with a posture.
-
-    The first output that an autopilot answers tells how the vehicle turns, for a rolling shutter.
+    Feed, provider and outputs are closed at the end. `posture_filter` smooths over time, in
+    addition to the raw values. The first output that an autopilot answers tells how the vehicle
+    turns, for a rolling shutter.
     """
 
     def __init__(
@@ -365,7 +347,7 @@ class LiveRunner:
         options: LiveOptions | None = None,
         posture_filter: PostureFilter | None = None,
     ) -> None:
-        self.n_measured = self.n_postures = 0
+        self.n_measured = self.n_postures = 0  # Frames until now; those with a posture.
         self._options = options or LiveOptions()
         self._provider, self._filter = provider, posture_filter
         self._mailbox = Mailbox(keep_every=self._options.keep_every)

@@ -94,8 +94,8 @@ class PilotSticks:
         return any(abs(s) > FULL * self._dead_band for s in swings if s != _INVALID)
 
     def _channels_moved(self) -> bool:
-        found = self._link.latest("RC_CHANNELS", system=self._link.system)
-        if found is None or found.age_s > FRESH_S:
+        found = _fresh(self._link, "RC_CHANNELS")
+        if found is None:
             return False
         since = found.received_ns - round(1e9 * FRESH_S)
         # The thread that sends may add while this one reads.
@@ -136,8 +136,8 @@ class DepthChoice:
         return None
 
     def _value(self, kind: str, field: str, scale: float) -> float | None:
-        received = self._link.latest(kind, system=self._link.system)
-        if received is None or received.age_s > FRESH_S:
+        received = _fresh(self._link, kind)
+        if received is None:
             return None
         value = scale * float(getattr(received.message, field))
         low, high = self._spans.get(kind, (value, value))
@@ -184,15 +184,16 @@ _log = logging.getLogger(__name__)
 
 def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | None]:
     """Return an autopilot's roll, pitch and heading (in [0, 2 pi)), in radians; None if unknown."""
-    found = _fresh_attitude(link)
+    found = _fresh(link, "ATTITUDE", _AUTOPILOT)
     if found is None:
         return None, None, None
     message = found.message
     return message.roll, message.pitch, message.yaw % (2.0 * math.pi)
 
 
-def _fresh_attitude(link: MavlinkLink) -> Received | None:
-    found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
+def _fresh(link: MavlinkLink, kind: str, component: int | None = None) -> Received | None:
+    """Return the vehicle's last message of a kind; None if it is older than `FRESH_S`."""
+    found = link.latest(kind, system=link.system, component=component)
     return None if found is None or found.age_s > FRESH_S else found
 
 
@@ -201,7 +202,7 @@ def gyro_rates_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
 
     `at_ns`: time of a picture, by `time.monotonic_ns`.
     """
-    found = _fresh_attitude(link)
+    found = _fresh(link, "ATTITUDE", _AUTOPILOT)
     if found is None:
         return None
     message = found.message

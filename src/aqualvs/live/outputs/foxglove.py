@@ -44,13 +44,23 @@ _LINE_PX = 2.0
 
 def transforms(rig: Rig, stamp_ns: int) -> "sdk.FrameTransforms":
     """Return where dome and camera are on the vehicle."""
-    from foxglove.messages import FrameTransforms
+    from foxglove.messages import FrameTransform, FrameTransforms
 
     camera = rig.dome_from_cam
+    frames = [
+        (VEHICLE, FRAME_ID, FLU_FROM_DOME, np.zeros(3)),
+        (FRAME_ID, "cam", camera.rotation, camera.translation),
+    ]
     return FrameTransforms(
         transforms=[
-            _transform(VEHICLE, FRAME_ID, FLU_FROM_DOME, np.zeros(3), stamp_ns),
-            _transform(FRAME_ID, "cam", camera.rotation, camera.translation, stamp_ns),
+            FrameTransform(
+                timestamp=_stamp(stamp_ns),
+                parent_frame_id=parent,
+                child_frame_id=child,
+                translation=_vector(origin),
+                rotation=_quaternion(rotation),
+            )
+            for parent, child, rotation, origin in frames
         ]
     )
 
@@ -122,20 +132,6 @@ def laser_lines(
     return found
 
 
-def _transform(
-    parent: str, child: str, rotation: FloatArray, origin: FloatArray, stamp_ns: int
-) -> "sdk.FrameTransform":
-    from foxglove.messages import FrameTransform
-
-    return FrameTransform(
-        timestamp=_stamp(stamp_ns),
-        parent_frame_id=parent,
-        child_frame_id=child,
-        translation=_vector(origin),
-        rotation=_quaternion(rotation),
-    )
-
-
 def _pose(rotation: FloatArray, origin: FloatArray) -> "sdk.Pose":
     from foxglove.messages import Pose
 
@@ -159,7 +155,7 @@ def _quaternion(rotation: FloatArray) -> "sdk.Quaternion":
 def _stamp(stamp_ns: int) -> "sdk.Timestamp":
     from foxglove.messages import Timestamp
 
-    return Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)
+    return Timestamp(*divmod(stamp_ns, 10**9))
 
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
@@ -171,20 +167,13 @@ _TRANSFORMS, _SCENE = "/aqualvs/transforms", "/aqualvs/scene"
 class FoxgloveOutput(Output):
     """Server of posture, points, picture, scene and health to any number of viewers.
 
+    `host`: address to listen on. Whoever reaches it can watch, and can do nothing else; "0.0.0.0"
+    opens it to the network. `port`: 0 takes any that is free. `scanner`: options that the postures
+    are measured with; shown beside the rig. `picture_hz`, `points_hz`: most pictures, and point
+    clouds, per second; 0 for none.
+
     Raises `OptionError` if foxglove-sdk is not installed. Raises `OutputError` if the address
     cannot be used.
-
-    Parameters
-    ----------
-    host : str
-        Address to listen on. Whoever reaches it can watch, and can do nothing else; "0.0.0.0"
-        opens it to the network.
-    port : int
-        0 takes any that is free.
-    scanner : ScannerOptions, optional
-        Options that the postures are measured with; shown beside the rig.
-    picture_hz, points_hz : float
-        Most pictures, and point clouds, per second; 0 for none.
     """
 
     name = "foxglove"
@@ -205,9 +194,8 @@ class FoxgloveOutput(Output):
         self._clock = RecordClock()
         # Channels do not keep it alive.
         self._context = context = foxglove.Context()
-        shown = [POSTURE, POINTS, PICTURE, HEALTH, RIG]
         self._channels: dict[RecordedTopic, Channel] = {}
-        for topic in shown:
+        for topic in (POSTURE, POINTS, PICTURE, HEALTH, RIG):
             schema = foxglove.Schema(
                 name=topic.kind, encoding="ros2msg", data=topic.definition.encode("utf-8")
             )

@@ -47,21 +47,9 @@ _log = logging.getLogger(__name__)
 class Ros1Node:
     """ROS 1 node that publishes topics; registers with roscore whenever that is there.
 
-    Parameters
-    ----------
-    name : str
-        Full name, such as `/aqualvs`.
-    topics : mapping
-        Type of each topic by its full name.
-    master_uri : str
-        Where roscore is.
-    environment : mapping
-        `ROS_HOSTNAME` or `ROS_IP`: the name that subscribers reach this machine by.
-
-    Raises
-    ------
-    OptionError
-        If `master_uri` is no address.
+    `name`: full name, such as `/aqualvs`. `topics`: type of each topic by its full name.
+    `master_uri`: where roscore is. `environment`: `ROS_HOSTNAME` or `ROS_IP`, the name that
+    subscribers reach this machine by. Raises `OptionError` if `master_uri` is no address.
     """
 
     def __init__(
@@ -283,27 +271,22 @@ class Ros1Output(Output):
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         master = environment.get("ROS_MASTER_URI") or DEFAULT_MASTER
-        self._names = {topic: topic.full_name for topic in PublishedTopic}
-        self._topics = {name: topic for topic, name in self._names.items()}
         self._store = ros1_store()
         self._maker = MessageMaker(RosOptions(), ros1_types(self._store))
         self._n_sent: Counter[PublishedTopic] = Counter()
         self._closed = False
-        types = {name: ros1_type(self._store, topic) for topic, name in self._names.items()}
+        types = {topic.full_name: ros1_type(self._store, topic) for topic in PublishedTopic}
         self._node = Ros1Node("/aqualvs", types, master, environment)
-
-    @property
-    def uri(self) -> str:
-        """Address of the node for calls by ROS."""
-        return self._node.uri
+        self.uri = self._node.uri  # Address of the node for calls by ROS.
 
     def send(self, sample: LiveSample) -> None:
         """Hand a sample's messages to the subscribers that are connected; returns at once."""
-        wanted = {self._topics[name] for name in self._node.links.listeners()}
+        listeners = self._node.links.listeners()
+        wanted = {topic for topic in PublishedTopic if listeners[topic.full_name]}
         for topic, message in self._maker.messages(sample, wanted):
             message.header.seq = self._n_sent[topic] % 2**32
             body = self._store.serialize_ros1(message, TYPE_NAMES[topic])
-            self._node.links.publish(self._names[topic], body)
+            self._node.links.publish(topic.full_name, body)
             self._n_sent[topic] += 1
 
     def health(self) -> PartHealth:

@@ -84,24 +84,19 @@ def _filtered_fields(filtered: FilteredPosture | None) -> dict[str, Value]:
     if filtered is None:
         return dict.fromkeys(_FILTERED_KEYS)
     speed, pitch_rate, yaw_rate = filtered.rates.tolist()
-    return dict(
-        zip(
-            _FILTERED_KEYS,
-            (
-                _fixed(filtered.range, 6),
-                _fixed(math.degrees(filtered.pitch), 5),
-                _fixed(math.degrees(filtered.yaw), 5),
-                *_sigmas(filtered.covariance),
-                _fixed(speed, 6),
-                _fixed(math.degrees(pitch_rate), 5),
-                _fixed(math.degrees(yaw_rate), 5),
-                _fixed(filtered.age_s, 6),
-                filtered.accepted,
-                *_sigmas(filtered.total_covariance),
-            ),
-            strict=True,
-        )
+    values = (
+        _fixed(filtered.range, 6),
+        _fixed(math.degrees(filtered.pitch), 5),
+        _fixed(math.degrees(filtered.yaw), 5),
+        *_sigmas(filtered.covariance),
+        _fixed(speed, 6),
+        _fixed(math.degrees(pitch_rate), 5),
+        _fixed(math.degrees(yaw_rate), 5),
+        _fixed(filtered.age_s, 6),
+        filtered.accepted,
+        *_sigmas(filtered.total_covariance),
     )
+    return dict(zip(_FILTERED_KEYS, values, strict=True))
 
 
 def _sigmas(covariance: FloatArray) -> list[Value]:
