@@ -11,7 +11,6 @@ from aqualvs.sources.spans import (
     SpanKind,
     SpanMismatchError,
     SpanReader,
-    image_frames,
     image_spans,
     video_spans,
 )
@@ -194,13 +193,13 @@ def test_the_parts_of_a_folder_of_images_are_the_whole(tmp_path):
     with open_source(tmp_path, fps=5.0) as source:
         whole = list(source)
     spans = [Span(kind=SpanKind.IMAGES, first=first, stop=stop) for first, stop in ((0, 3), (3, 7))]
-    parts = [frame for span in spans for frame in image_frames(tmp_path, span, 5.0)]
+    parts = [frame for span in spans for frame in SpanReader(tmp_path, SIZE, 5.0).frames(span)]
     assert [(f.index, f.time_s) for f in parts] == [(f.index, f.time_s) for f in whole]
     for part, one in zip(parts, whole, strict=True):
         assert np.array_equal(part.luma, one.luma)
     (tmp_path / "4.png").write_bytes(b"torn")
     with pytest.raises(SpanMismatchError):
-        list(image_frames(tmp_path, spans[1], 5.0))
+        list(SpanReader(tmp_path, SIZE, 5.0).frames(spans[1]))
 
 
 def units(codec, *heads, extradata=b""):

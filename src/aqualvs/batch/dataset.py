@@ -86,13 +86,9 @@ def drafted(folder: Path) -> Iterator[Path]:
 
     Raises `OSError` as the system says it.
     """
-    draft = folder.with_name(f"{folder.name}.{uuid.uuid4().hex[:8]}.part")
-    draft.mkdir(parents=True)
-    try:
+    with scratch(folder.parent, folder.name) as draft:
         yield draft
         _publish(draft, folder)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -227,7 +223,7 @@ def holds(dataset: Path, name: str, tables: Iterable[str]) -> bool:
 def drop(dataset: Path, name: str, tables: Iterable[str]) -> None:
     """Remove these partitions of a dive, if they are there."""
     for table in tables:
-        shutil.rmtree(_partition(dataset, name, table).parent, ignore_errors=True)
+        clear(_partition(dataset, name, table).parent)
 
 
 def _partition(dataset: Path, name: str, table: str) -> Path:

@@ -53,7 +53,7 @@ from aqualvs.run_outputs import RunBareLens
 from aqualvs.scanning.row_motion import REACH
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.fields import frames_in, frames_of
-from aqualvs.sources.spans import Span, SpanKind, SpanReader, image_frames
+from aqualvs.sources.spans import Span, SpanKind, SpanReader
 from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
@@ -171,21 +171,18 @@ def _frames(dive: OpenDive, span: Span) -> Iterator[Frame]:
 
     The first of a dive that is not cut has been decoded.
     """
-    path, shutter = Path(dive.request.source), dive.rig.shutter
     if span.kind is SpanKind.WHOLE:
         return ready(iter(dive.source), dive.source, FrameWindow())
-    if span.kind is SpanKind.VIDEO:
-        pictures = _video_frames(path, span, dive.rig.size_px)
-    else:
-        pictures = image_frames(path, span, dive.request.fps or 1.0)
+    shutter = dive.rig.shutter
     first, stop = frames_in(span, shutter)
     near = range(first - REACH, stop + REACH)
-    return (frame for frame in frames_of(pictures, shutter) if frame.index in near)
+    return (frame for frame in frames_of(_pictures(dive, span), shutter) if frame.index in near)
 
 
-def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[Frame]:
-    with SpanReader(path, size_px) as video:
-        yield from video.frames(span)
+def _pictures(dive: OpenDive, span: Span) -> Iterator[Frame]:
+    path, fps = Path(dive.request.source), dive.request.fps or 1.0
+    with SpanReader(path, dive.rig.size_px, fps) as pictures:
+        yield from pictures.frames(span)
 
 
 def _blocks(

@@ -323,21 +323,24 @@ class SpanMismatchError(Exception):
 
 
 class SpanReader(Closing):
-    """Reader of spans of a video, opened once for all of them; a context manager.
+    """Reader of spans of a video, opened once for all of them, or of a folder of images.
 
-    `size_px`: width and height of every picture.
+    `size_px`: width and height of every picture of the video. `fps`: frame rate of the images.
     """
 
-    def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
-        self._path, self._size_px = path, size_px
+    def __init__(self, path: Path, size_px: tuple[int, int], fps: float = 1.0) -> None:
+        self._path, self._size_px, self._fps = path, size_px, fps
         self._container: InputContainer | None = None
 
     def frames(self, span: Span) -> Iterator[Frame]:
-        """Decode a part; frames have the index and the time that the whole video gives them.
+        """Decode a part; frames have the index and the time that the whole dive gives them.
 
-        `span`: from `video_spans` of the same file. Raises `SpanMismatchError` if any picture is
-        damaged or missing: the whole video decides what becomes of those that follow.
+        `span`: from `video_spans` or `image_spans` of the same dive. Raises `SpanMismatchError` if
+        any picture is damaged or missing: the whole dive decides what becomes of those that follow.
         """
+        if span.kind is SpanKind.IMAGES:
+            yield from _image_frames(self._path, span, self._fps)
+            return
         index, latest = span.first, span.origin_pts - 1
         try:
             stream = self._stream(span)
@@ -375,11 +378,8 @@ class SpanReader(Closing):
         return self._container.streams.video[0]
 
 
-def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
-    """Read a part of a folder of images, as `ImageSource` reads all of it.
-
-    Raises `SpanMismatchError` if an image cannot be read, or there are others than there were.
-    """
+def _image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
+    """Read a part of a folder of images, as `ImageSource` reads all of it."""
     try:
         source = ImageSource(images_in(folder)[span.first : span.stop], fps=fps)
         index = span.first

@@ -7,13 +7,12 @@
 - `in_blocks`, `read_ahead`: blocks of frames, and a thread that reads them ahead.
 """
 
-import contextlib
-import queue
-import threading
+from collections import deque
 from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
@@ -128,43 +127,15 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
     An exception of `items` is raised where it belongs in the order. When the iteration is given up,
     the thread ends after the item that it is fetching.
     """
-    fetched: queue.Queue[T | _End] = queue.Queue(1)
-    given_up = threading.Event()
-
-    timeout_s = 0.1
-
-    def put(item: T | _End) -> None:
-        while not given_up.is_set():
-            with contextlib.suppress(queue.Full):
-                return fetched.put(item, timeout=timeout_s)
-        return None
-
-    def fetch() -> None:
+    end = object()
+    with ThreadPoolExecutor(1, "frames") as thread:
         try:
-            for item in items:
-                put(item)
-                if given_up.is_set():
-                    return
-            put(_End())
-        except BaseException as fault:  # raised again by the consumer
-            put(_End(fault))
-
-    thread = threading.Thread(target=fetch, name="frames", daemon=True)
-    thread.start()
-    try:
-        while not isinstance(item := fetched.get(), _End):
-            yield item
-        if item.fault is not None:
-            raise item.fault
-    finally:
-        given_up.set()
-        thread.join()
-
-
-class _End(NamedTuple):
-    """Mark of the end of the items."""
-
-    fault: BaseException | None = None  # Exception that ended them.
+            fetched = deque(thread.submit(next, items, end) for _ in range(2))
+            while (item := fetched.popleft().result()) is not end:
+                fetched.append(thread.submit(next, items, end))
+                yield cast("T", item)
+        finally:
+            thread.shutdown(cancel_futures=True)
 
 
 class ScanInputs(NamedTuple):

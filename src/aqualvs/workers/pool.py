@@ -36,20 +36,11 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.shutter import Shutter
 from aqualvs.results.run_request import FrameWindow
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.sources.fields import frames_in, frames_of, source_of_pictures
 from aqualvs.sources.images import images_in
-from aqualvs.sources.spans import (
-    Span,
-    SpanKind,
-    SpanMismatchError,
-    SpanReader,
-    image_frames,
-    image_spans,
-    video_spans,
-)
+from aqualvs.sources.spans import Span, SpanMismatchError, SpanReader, image_spans, video_spans
 from aqualvs.workers.frame_results import FrameProcessor, FrameResult, in_blocks
 from aqualvs.workers.start_method import blocked_interrupts, context, ignored_interrupts
 
@@ -66,8 +57,6 @@ Message: TypeAlias = list[FrameResult] | Ended
 
 _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fields(ScanPoints)}
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
-_ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
-_NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
 
 
 def pack(message: Message, memory: NDArray[np.uint8]) -> bytes:
@@ -82,16 +71,8 @@ def pack(message: Message, memory: NDArray[np.uint8]) -> bytes:
     stops = np.cumsum([len(one) for one in points]).tolist()
     for name, column in zip(_COLUMNS, _columns(memory, stops[-1]), strict=True):
         np.concatenate([getattr(one, name) for one in points], out=column, casting="no")
-    heads = [
-        (
-            result.scan.index,
-            result.scan.time_s,
-            _to_plain(result.scan.posture),
-            result.scan.n_water,
-            _to_plain(result.bare),
-        )
-        for result in message
-    ]
+    scans = ((result.scan, result.bare) for result in message)
+    heads = [(scan.index, scan.time_s, scan.posture, scan.n_water, bare) for scan, bare in scans]
     return pickle.dumps((heads, stops), pickle.HIGHEST_PROTOCOL)
 
 
@@ -108,27 +89,10 @@ def unpack(parcel: bytes, memory: NDArray[np.uint8]) -> Message:
     found, first = [], 0
     for (index, time_s, posture, n_water, bare), stop in zip(heads, stops, strict=True):
         points = ScanPoints(*[column[first:stop] for column in columns])
-        scan = Scan(index, time_s, _from_plain(posture), points, n_water)
-        found.append(FrameResult(scan, _from_plain(bare)))
+        scan = Scan(index, time_s, posture, points, n_water)
+        found.append(FrameResult(scan, bare))
         first = stop
     return found
-
-
-def _to_plain(posture: Posture | Refusal | None) -> Any:
-    """Return a posture as plain numbers, which are pickled several times as fast."""
-    if not isinstance(posture, Posture):
-        return posture
-    numbers = [getattr(posture, name) for name in _NUMBERS]
-    return numbers, [getattr(posture, name).tolist() for name in _ARRAYS]
-
-
-def _from_plain(plain: Any) -> Any:
-    if not isinstance(plain, tuple):
-        return plain
-    numbers, arrays = plain
-    values: dict[str, Any] = dict(zip(_NUMBERS, numbers, strict=True))
-    values |= zip(_ARRAYS, map(np.array, arrays), strict=True)
-    return Posture(**values)
 
 
 def _columns(memory: NDArray[np.uint8], n_points: int) -> Iterator[NDArray[Any]]:
@@ -293,14 +257,10 @@ def serve(
     sender = Sender(pipe, memory)
     try:
         processor = FrameProcessor(job.rig, Scanner(job.rig, job.options))
-        with SpanReader(job.path, job.rig.size_px) as video:
+        with SpanReader(job.path, job.rig.size_px, job.fps) as pictures:
             while True:
                 part = job.parts[sender.next_part()]
-                if part.span.kind is SpanKind.VIDEO:
-                    pictures = video.frames(part.span)
-                else:
-                    pictures = image_frames(job.path, part.span, job.fps)
-                frames = frames_of(pictures, job.rig.shutter)
+                frames = frames_of(pictures.frames(part.span), job.rig.shutter)
                 for message in _messages(part, job.rig.shutter, frames, processor):
                     sender.send(message)
     except (EOFError, ConnectionError):
