@@ -27,8 +27,9 @@ from scipy import ndimage
 
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.vehicle_logs.tlog import Candidate, choose_depth, damage_notes
+from aqualvs.vehicle_logs.tlog import choose_depth, damage_notes
 from aqualvs.vehicle_logs.vehicle_log import (
+    Found,
     Interpolation,
     Signal,
     VehicleLog,
@@ -308,8 +309,8 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
         )
     begin = min(starts)
     candidates = [
-        Candidate(_signal(tables, begin, record, column, scale), f"{record}.{column}")
-        for record, column, scale in (
+        _signal(tables, begin, *source)
+        for source in (
             ("CTUN", "Alt", -1.0),
             ("POS", "RelHomeAlt", -1.0),
             ("XKF1", "PD", 1.0),
@@ -317,15 +318,15 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
             ("CTUN", "BAlt", -1.0),
         )
     ]
-    pressure = candidates[-1].depth
+    pressure, _ = candidates[-1]
     depth, stuck = choose_depth([*candidates, _barometer(tables, begin)], pressure)
-    found: dict[str, tuple[Signal | None, str]] = {"depth": depth}
+    found = {"depth": depth}
     for name, column, interpolation in (
         ("heading", "Yaw", Interpolation.BEARING),
         ("roll", "Roll", Interpolation.ANGLE),
         ("pitch", "Pitch", Interpolation.ANGLE),
     ):
-        found[name] = _angle(tables, begin, column, interpolation), f"ATT.{column}"
+        found[name] = _signal(tables, begin, "ATT", column, interpolation=interpolation)
     utc, utc_from = _start_utc(tables, begin)
     # The vehicle's clock is set once, to about a second.
     utc_sigma_s = 1.0
@@ -347,66 +348,63 @@ def _first_core(tables: _Tables) -> _Tables:
     """Return the tables with records of the first core only, where a filter has several."""
     kept = dict(tables)
     for name in ("XKF1", "NKF1"):
-        table = tables.get(name)
-        if table is not None and "C" in table:
-            first = table["C"] == 0
-            kept[name] = {column: values[first] for column, values in table.items()}
+        table = tables.get(name, {})
+        if "C" in table:
+            kept[name] = {column: values[table["C"] == 0] for column, values in table.items()}
     return kept
 
 
 def _signal(
-    tables: _Tables, begin: float, kind: str, column: str, scale: float = 1.0
-) -> Signal | None:
-    """Return a scaled column as a signal, None if it is missing; `begin` is log time 0."""
-    table = tables.get(kind)
-    if table is None or column not in table:
-        return None
-    values = scale * table[column]
+    tables: _Tables,
+    begin: float,
+    record: str,
+    column: str,
+    scale: float = 1.0,
+    interpolation: Interpolation = Interpolation.LINEAR,
+) -> Found:
+    """Return a column as a signal, None if it is missing, and its source; `begin` is log time 0.
+
+    Depths are scaled, angles are turned from degrees into radians.
+    """
+    table, source = tables.get(record, {}), f"{record}.{column}"
+    if column not in table:
+        return None, source
     # Records have no checksum: damaged ones may contain any number. No sea is deeper.
-    max_depth_m = 12000.0
-    values = np.where(np.abs(values) <= max_depth_m, values, np.nan)
-    return Signal.from_samples(table["time_s"] - begin, values)
+    max_depth_m, max_angle_deg = 12000.0, 720.0
+    is_depth = interpolation is Interpolation.LINEAR
+    largest = max_depth_m if is_depth else max_angle_deg
+    values = np.where(np.abs(table[column]) <= largest, table[column], np.nan)
+    if is_depth:
+        values = scale * values
+    elif interpolation is Interpolation.BEARING:
+        values = bearing_of(np.deg2rad(values))
+    else:
+        values = wrap(np.deg2rad(values))
+    return Signal.from_samples(table["time_s"] - begin, values, interpolation), source
 
 
-def _angle(
-    tables: _Tables, begin: float, column: str, interpolation: Interpolation
-) -> Signal | None:
-    """Return an angle of `ATT` as a signal in radians."""
-    table = tables.get("ATT")
-    if table is None or column not in table:
-        return None
-    # Records have no checksum: damaged ones may contain any number.
-    largest_deg = 720.0
-    angle = np.deg2rad(np.where(np.abs(table[column]) <= largest_deg, table[column], np.nan))
-    angle = bearing_of(angle) if interpolation is Interpolation.BEARING else wrap(angle)
-    return Signal.from_samples(table["time_s"] - begin, angle, interpolation)
-
-
-def _barometer(tables: _Tables, begin: float) -> Candidate:
+def _barometer(tables: _Tables, begin: float) -> Found:
     """Return the depth by the last barometer, which is the one in the water."""
-    table = tables.get("BARO")
-    if table is None or "Alt" not in table:
-        return Candidate(None, "BARO.Alt")
+    table = tables.get("BARO", {})
+    if "Alt" not in table:
+        return None, "BARO.Alt"
     number = table.get("I", np.zeros(len(table["Alt"])))
     outer = number == number.max()
     depth = Signal.from_samples(table["time_s"][outer] - begin, -table["Alt"][outer])
-    return Candidate(depth, f"BARO.Alt of sensor {number.max():.0f}")
+    return depth, f"BARO.Alt of sensor {number.max():.0f}"
 
 
 def _start_utc(tables: _Tables, begin: float) -> tuple[float | None, str]:
     """Return the UTC of log time 0, and its source."""
-    gps = tables.get("GPS")
+    gps, rtc = tables.get("GPS", {}), tables.get("RTC", {})
     # 1980-01-06, leap seconds between GPS time and UTC since 2017, and least status of a 3D fix.
     gps_epoch_s, leap_s, week_s, gps_fix = 315964800.0, 18.0, 604800.0, 3
-    if gps is not None and {"GWk", "GMS", "Status"} <= set(gps):
+    if {"GWk", "GMS", "Status"} <= set(gps):
         fixed = (gps["Status"] >= gps_fix) & (gps["GWk"] > 0)
         if fixed.any():
             utc = gps_epoch_s + week_s * gps["GWk"] + gps["GMS"] * 1e-3 - leap_s
             return float(np.median((utc - gps["time_s"])[fixed])) + begin, "GPS.GWk, GMS"
-    rtc = tables.get("RTC")
-    if rtc is not None and "Epoch" in rtc:
-        known = rtc["Epoch"] > 0
-        if known.any():
-            ahead = rtc["Epoch"] * 1e-6 - rtc["time_s"]
-            return float(np.median(ahead[known])) + begin, "RTC.Epoch"
+    if "Epoch" in rtc and (rtc["Epoch"] > 0).any():
+        ahead = rtc["Epoch"] * 1e-6 - rtc["time_s"]
+        return float(np.median(ahead[rtc["Epoch"] > 0])) + begin, "RTC.Epoch"
     return None, ""

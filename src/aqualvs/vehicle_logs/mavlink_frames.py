@@ -40,47 +40,35 @@ class Message:
         return np.dtype(list(self.fields))
 
 
-def _floats(names: str) -> tuple[tuple[str, str], ...]:
-    return tuple((name, "<f4") for name in names.split())
+def _fields(**names: str) -> tuple[tuple[str, str], ...]:
+    """Return fields by their type, as MAVLink orders them: the longest first."""
+    return tuple((name, f"<{kind}") for kind, listed in names.items() for name in listed.split())
 
 
 _BOOT = ("time_boot_ms", "<u4")
-_PRESSURE = (_BOOT, *_floats("press_abs press_diff"), ("temperature", "<i2"))
 MESSAGES: Mapping[int, Message] = {
     0: Message(
         "HEARTBEAT",
-        (
-            ("custom_mode", "<u4"),
-            ("type", "u1"),
-            ("autopilot", "u1"),
-            ("base_mode", "u1"),
-            ("system_status", "u1"),
-            ("mavlink_version", "u1"),
-        ),
+        _fields(u4="custom_mode", u1="type autopilot base_mode system_status mavlink_version"),
         50,
     ),
-    30: Message("ATTITUDE", (_BOOT, *_floats("roll pitch yaw rollspeed pitchspeed yawspeed")), 39),
+    30: Message(
+        "ATTITUDE", (_BOOT, *_fields(f4="roll pitch yaw rollspeed pitchspeed yawspeed")), 39
+    ),
     # For its time alone.
-    32: Message("LOCAL_POSITION_NED", (_BOOT, *_floats("x y z vx vy vz")), 185),
+    32: Message("LOCAL_POSITION_NED", (_BOOT, *_fields(f4="x y z vx vy vz")), 185),
     33: Message(
         "GLOBAL_POSITION_INT",
-        (
-            _BOOT,
-            *((name, "<i4") for name in ("lat", "lon", "alt", "relative_alt")),
-            *((name, "<i2") for name in ("vx", "vy", "vz")),
-            ("hdg", "<u2"),
-        ),
+        (_BOOT, *_fields(i4="lat lon alt relative_alt", i2="vx vy vz", u2="hdg")),
         104,
     ),
     74: Message(
-        "VFR_HUD",
-        (*_floats("airspeed groundspeed alt climb"), ("heading", "<i2"), ("throttle", "<u2")),
-        20,
+        "VFR_HUD", _fields(f4="airspeed groundspeed alt climb", i2="heading", u2="throttle"), 20
     ),
-    137: Message("SCALED_PRESSURE2", _PRESSURE, 195),
-    178: Message(
-        "AHRS2", (*_floats("roll pitch yaw altitude"), ("lat", "<i4"), ("lng", "<i4")), 47
+    137: Message(
+        "SCALED_PRESSURE2", (_BOOT, *_fields(f4="press_abs press_diff", i2="temperature")), 195
     ),
+    178: Message("AHRS2", _fields(f4="roll pitch yaw altitude", i4="lat lng"), 47),
 }
 """By message id: the messages that are read (definitions: common.xml, ardupilotmega.xml)."""
 

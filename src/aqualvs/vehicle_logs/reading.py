@@ -27,6 +27,7 @@ from aqualvs.vehicle_logs.mavlink_frames import looks_like_frames
 from aqualvs.vehicle_logs.tlog import read_tlog
 from aqualvs.vehicle_logs.vehicle_log import (
     NETWORK_UTC_SIGMA_S,
+    Found,
     Interpolation,
     Signal,
     VehicleLog,
@@ -201,7 +202,7 @@ def _log(
     if repeated:
         notes = (*notes, f"{repeated} rows repeat the time of the row before and are left out")
 
-    found: dict[str, tuple[Signal | None, str]] = {}
+    found: dict[str, Found] = {}
     for column in VALUE_COLUMNS:
         if column not in table:
             continue

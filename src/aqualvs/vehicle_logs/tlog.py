@@ -13,10 +13,10 @@ Messages read for each signal, with reasons:
 `TelemetryClock` gives all messages times of the autopilot's clock, across reboots, and its UTC.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,19 +26,13 @@ from aqualvs.vehicle_logs.mavlink_frames import SelectedMessages, Table, read_fr
 from aqualvs.vehicle_logs.vehicle_log import (
     FIRST_BELIEVED_UTC_S,
     NETWORK_UTC_SIGMA_S,
+    Found,
     Interpolation,
     Signal,
     VehicleLog,
     bearing_of,
     log_of,
 )
-
-
-class Candidate(NamedTuple):
-    """Candidate for the depth in a log."""
-
-    depth: Signal | None  # Metres, positive down; None if the log does not have it.
-    source: str  # Message or record, and field.
 
 
 def damage_notes(skipped: Sequence[tuple[int, int]], unit: str, what: str) -> list[str]:
@@ -53,8 +47,8 @@ def damage_notes(skipped: Sequence[tuple[int, int]], unit: str, what: str) -> li
 
 
 def choose_depth(
-    candidates: Sequence[Candidate], pressure_depth: Signal | None
-) -> tuple[Candidate, str | None]:
+    candidates: Sequence[Found], pressure_depth: Signal | None
+) -> tuple[Found, str | None]:
     """Return the first candidate with a changing depth, and a note on one that is stuck.
 
     A filter without an origin reports a constant instead of the depth, although the pressure
@@ -64,17 +58,15 @@ def choose_depth(
     note = None
     # Shortest dive, in metres, that shows it, and share of it below which a candidate is stuck.
     min_dive_m, stuck_share = 0.5, 0.1
-    for candidate in candidates:
-        if candidate.depth is None:
+    for depth, source in candidates:
+        if depth is None:
             continue
-        if dived > min_dive_m and _span(candidate.depth) < stuck_share * dived:
-            note = note or (
-                f"{candidate.source} stands still while the pressure changes by {dived:.1f} m of "
-                "water; not used"
-            )
-            continue
-        return candidate, note
-    return Candidate(None, ""), note
+        if dived <= min_dive_m or _span(depth) >= stuck_share * dived:
+            return (depth, source), note
+        note = note or (
+            f"{source} stands still while the pressure changes by {dived:.1f} m of water; not used"
+        )
+    return (None, ""), note
 
 
 def _span(depth: Signal) -> float:
@@ -113,13 +105,12 @@ class TelemetryClock:
 def telemetry_clock(tables: Mapping[str, Table]) -> TelemetryClock:
     """Return the clock of an autopilot's messages; there must be at least one."""
     timed = [t for t in tables.values() if _BOOT in (t.payload.dtype.names or ())]
+    table = max(timed or tables.values(), key=lambda t: len(t.at))
+    received = table.received_us / 1e6
     if not timed:
-        table = max(tables.values(), key=lambda t: len(t.at))
-        received = table.received_us / 1e6
         none = np.zeros(0)
         return _with_utc(table, received - received[0], none.astype(np.int64), none, ())
-    table = max(timed, key=lambda t: len(t.at))
-    boot, received = table.payload[_BOOT] / 1e3, table.received_us / 1e6
+    boot = table.payload[_BOOT] / 1e3
     # A larger step back, in seconds, is a reboot.
     reboot_s = 2.0
     firsts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(boot) < -reboot_s)])
@@ -174,7 +165,6 @@ PRESSURE_FIELD = ("SCALED_PRESSURE2", "press_abs", 100.0 / (1025.0 * 9.80665))
 """The same of the outer pressure, which gives changes of the depth."""
 
 _Tables = Mapping[str, Table]
-_Found = tuple[Signal | None, str]
 
 
 def read_tlog(path: Path) -> VehicleLog:
@@ -188,7 +178,7 @@ def read_tlog(path: Path) -> VehicleLog:
     tables = {name: table for name, table in own.items() if len(table.at)}
     clock = telemetry_clock(tables)
     candidates = [
-        Candidate(_signal(tables, clock, message, field, scale), f"{message}.{field}")
+        (_signal(tables, clock, message, field, scale), f"{message}.{field}")
         for message, field, scale in DEPTH_FIELDS
     ]
     depth, stuck = choose_depth(candidates, _signal(tables, clock, *PRESSURE_FIELD))
@@ -255,20 +245,19 @@ def _signal(
     return Signal.from_samples(clock.of(table), values, interpolation)
 
 
-def _heading(tables: _Tables, clock: TelemetryClock) -> _Found:
+def _heading(tables: _Tables, clock: TelemetryClock) -> Found:
     """Return the heading from the best message that has it, and its source."""
-    heading = _signal(tables, clock, "ATTITUDE", "yaw", interpolation=Interpolation.BEARING)
-    if heading is not None:
-        return heading, "ATTITUDE.yaw"
-    table = tables.get("GLOBAL_POSITION_INT")
+    known, table = dict(tables), tables.get("GLOBAL_POSITION_INT")
     unknown_heading = 65535
     if table is not None:
-        known = dict(tables)
         known["GLOBAL_POSITION_INT"] = table[table.payload["hdg"] != unknown_heading]
-        scale = float(np.deg2rad(0.01))
-        heading = _signal(known, clock, "GLOBAL_POSITION_INT", "hdg", scale, Interpolation.BEARING)
-        if heading is not None:
-            return heading, "GLOBAL_POSITION_INT.hdg"
-    scale = float(np.deg2rad(1.0))
-    heading = _signal(tables, clock, "VFR_HUD", "heading", scale, Interpolation.BEARING)
-    return heading, "VFR_HUD.heading (whole degrees)"
+    heading, source = None, ""
+    for message, field, unit, precision in (
+        ("ATTITUDE", "yaw", 1.0, ""),
+        ("GLOBAL_POSITION_INT", "hdg", math.radians(0.01), ""),
+        ("VFR_HUD", "heading", math.radians(1.0), " (whole degrees)"),
+    ):
+        if heading is None:
+            heading = _signal(known, clock, message, field, unit, Interpolation.BEARING)
+            source = f"{message}.{field}{precision}"
+    return heading, source

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -93,6 +93,10 @@ class Signal:
             values = bearing_of(values)
         values[~valid] = np.nan
         return values, valid
+
+
+Found: TypeAlias = tuple[Signal | None, str]
+"""A signal, None if the log does not have it, and the message or record, and field, it is from."""
 
 
 def utc_seconds(text: str) -> float:
@@ -187,7 +191,7 @@ class VehicleLog:
 def log_of(
     path: Path,
     kind: str,
-    found: Mapping[str, tuple[Signal | None, str]],
+    found: Mapping[str, Found],
     *,
     start_utc_s: float | None,
     start_utc_sigma_s: float | None,
