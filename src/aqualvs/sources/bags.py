@@ -33,7 +33,7 @@ from aqualvs.sources.image_messages import (
     image_of_protobuf,
     image_of_ros,
 )
-from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, Op, decompressed
+from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, Op, decompressed, record_places
 from aqualvs.special_files import refuse_special
 
 # Disk space to keep free where bags compressed as whole files are unpacked.
@@ -340,22 +340,13 @@ def _records_of(chunk: Any, *, messages: bool = True) -> list[Any]:
     if max(chunk.uncompressed_size, len(chunk.data)) > MAX_BYTES:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     raw = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
-    places = list(itertools.islice(_record_places(raw), _MAX_RECORDS + 1))
+    places = list(itertools.islice(record_places(raw), _MAX_RECORDS + 1))
     # As objects, the smallest records take ten times the memory of their bytes.
     if len(places) > _MAX_RECORDS:
         raise ValueError(f"a chunk of more than {_MAX_RECORDS} records")
     if not messages:
         raw = b"".join(raw[a:b] for a, b in places if raw[a] != Op.MESSAGE)
     return list(breakup_chunk(replace(chunk, compression="", data=raw)))
-
-
-def _record_places(raw: bytes) -> Iterator[tuple[int, int]]:
-    """Yield where the records of a chunk begin and end."""
-    at = 0
-    while at + HEAD_BYTES <= len(raw):
-        end = at + HEAD_BYTES + int.from_bytes(raw[at + 1 : at + HEAD_BYTES], "little")
-        yield at, end
-        at = end
 
 
 def _summary(stream: "_Bounded") -> Any:

@@ -107,23 +107,11 @@ def bgr_of(frame: Frame) -> ImagePlane:
 
 
 def planes_of(picture: VideoFrame) -> Planes:
-    """Return luma and chroma of a decoded picture.
+    """Return luma, shape (height, width), and chroma of a decoded picture.
 
-    Parameters
-    ----------
-    picture : VideoFrame
-        Any pixel format; 4:2:0 with 8 bits and 8-bit grey are viewed in place, others converted.
-
-    Returns
-    -------
-    luma : uint8 array, shape (height, width)
-    chroma : (uint8 array, uint8 array) or None
-        U and V, shape (ceil(height/2), ceil(width/2)); None for a grey picture.
-
-    Notes
-    -----
-    The arrays keep the decoder's buffer alive. They are read-only, because the decoder still
-    predicts later pictures from it.
+    Chroma is U and V, shape (ceil(height/2), ceil(width/2)), or None for a grey picture. Pictures
+    in 4:2:0 with 8 bits and in 8-bit grey are viewed in place, others converted. The arrays keep
+    the decoder's buffer alive, and are read-only, because it still predicts later pictures from it.
     """
     kind = picture.format.name
     if kind in ("yuv420p", "yuvj420p"):

@@ -142,19 +142,8 @@ def transport_content(datagram: bytes) -> bytes | None:
 class Datagrams:
     """Receiver on a UDP port, and queue of what comes; its thread empties the system's buffer.
 
-    Parameters
-    ----------
-    address : UdpAddress
-        Where to listen.
-    ended : Event
-        Set when the feed ends.
-    reception : Reception
-        Told of what cannot be used.
-
-    Raises
-    ------
-    OSError
-        If the system refuses: the port is taken, the address is none of this machine.
+    `ended`: set when the feed ends. `reception`: told of what cannot be used. Raises `OSError` if
+    the system refuses to listen: the port is taken, the address is none of this machine.
     """
 
     def __init__(self, address: UdpAddress, ended: threading.Event, reception: Reception) -> None:

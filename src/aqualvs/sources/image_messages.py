@@ -214,15 +214,14 @@ def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
         stamp = protobuf_fields(_bytes(fields, 1))
         encoding_at, data_at = _PROTOBUF_FIELDS[schema]
         encoding = _bytes(fields, encoding_at).decode("utf-8", "replace")
-        found = ImageMessage(
+        is_raw = schema == "foxglove.RawImage"
+        return ImageMessage(
             stamp_ns=_int(stamp, 1) * 1_000_000_000 + _int(stamp, 2),
-            encoding=encoding,
+            encoding=encoding if is_raw else _still(encoding),
             data=_bytes(fields, data_at),
+            size_px=(_int(fields, 2), _int(fields, 3)) if is_raw else None,
+            step=_int(fields, 5) if is_raw else 0,
         )
-        if schema == "foxglove.RawImage":
-            size_px = _int(fields, 2), _int(fields, 3)
-            return replace(found, size_px=size_px, step=_int(fields, 5))
-        return replace(found, encoding=_still(encoding))
 
     return read
 
@@ -324,23 +323,11 @@ def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> Im
 class MessageSource(Closing):
     """Source of the images of one topic; satisfies `FrameSource`.
 
-    Parameters
-    ----------
-    name : str
-        Path and topic.
-    messages : callable
-        Begins to read, from the first message on; ends early where the recording is cut short,
-        by raising `SourceError`.
-    n_frames : int or None
-        Messages that the recording promises.
+    `name`: path and topic. `messages`: begins to read, from the first message on; ends early where
+    the recording is cut short, by raising `SourceError`. `n_frames`: messages that the recording
+    promises. Raises `SourceError` if no picture can be decoded at the start, or its encoding is
+    unknown.
 
-    Raises
-    ------
-    SourceError
-        If no picture can be decoded at the start, or its encoding is unknown.
-
-    Notes
-    -----
     Times are those of the pictures where the messages have them, else those of the log. Pictures of
     a video that are predicted from a lost one are not delivered (see `LiveDecoder`).
     """

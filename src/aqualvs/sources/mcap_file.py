@@ -117,18 +117,9 @@ def chunk_index(
 ) -> bytes:
     """Return where a chunk is.
 
-    Parameters
-    ----------
-    times_ns : (int, int)
-        Of its first and last message.
-    at, length : int
-        Of the chunk's record in the file.
-    index_offsets : mapping
-        Where each channel's message index is in the file.
-    index_length : int
-        Of all these indexes together.
-    sizes : (int, int)
-        Compressed and raw.
+    `times_ns`: of its first and last message. `at`, `length`: of the chunk's record in the file.
+    `index_offsets`: where each channel's message index is in the file, `index_length`: of all these
+    together. `sizes`: compressed and raw.
     """
     offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
     return record(
@@ -416,12 +407,19 @@ def decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
 
 
 def _messages(raw: bytes, topics: dict[int, str]) -> Iterator[StoredMessage]:
-    at = 0
-    while at + HEAD_BYTES <= len(raw):
-        kind, length = struct.unpack_from("<BQ", raw, at)
-        start, at = at + HEAD_BYTES, at + HEAD_BYTES + length
-        if kind == Op.MESSAGE:
+    for first, stop in record_places(raw):
+        if raw[first] == Op.MESSAGE:
+            start = first + HEAD_BYTES
             number, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(raw, start)
             if number in topics:
-                data = raw[start + _MESSAGE_HEAD.size : at]
+                data = raw[start + _MESSAGE_HEAD.size : stop]
                 yield StoredMessage(topics[number], log_ns, data)
+
+
+def record_places(raw: bytes) -> Iterator[tuple[int, int]]:
+    """Yield where each record of a chunk's raw content begins and ends."""
+    at = 0
+    while at + HEAD_BYTES <= len(raw):
+        end = at + HEAD_BYTES + int.from_bytes(raw[at + 1 : at + HEAD_BYTES], "little")
+        yield at, end
+        at = end

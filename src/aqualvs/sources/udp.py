@@ -216,17 +216,10 @@ def decoder_of(codec: str, parameter_sets: bytes = b"") -> VideoCodecContext:
 class UdpFeed:
     """Feed from a UDP port, whatever kind of stream arrives; satisfies `Feed`.
 
-    Parameters
-    ----------
-    name : str
-        How health and messages call it.
-    parameter_sets : bytes
-        SPS and PPS as a byte stream, where an SDP file has them; else they come in the stream.
-    payload_type : int or None
-        Of RTP; None takes every dynamic one (96 to 127).
+    `name`: how health and messages call it. `parameter_sets`: SPS and PPS as a byte stream, where
+    an SDP file has them; else they come in the stream. `payload_type`: of RTP; None takes every
+    dynamic one (96 to 127).
 
-    Notes
-    -----
     RTP and MPEG-TS are unpacked here and not by FFmpeg, whose interface hides which packets are
     lost, and which probes a stream before it shows a picture and holds one or two back. What a
     bare stream loses is found by the pictures' numbers only, and each of its pictures waits for

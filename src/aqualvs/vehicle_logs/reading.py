@@ -61,7 +61,9 @@ def read_csv_log(path: Path) -> VehicleLog:
         raise SourceError(
             f"{path}: holds no rows; write 'time_s,depth_m,heading_deg' and a line for each time"
         )
-    names, ignored = _columns([cell.strip() for cell in rows[0][1]], path)
+    names = [cell.strip() for cell in rows[0][1]]
+    _check_columns(names, path)
+    ignored = [name for name in names if name and name not in _COLUMNS]
     notes = (f"columns not used: {', '.join(ignored)}",) if ignored else ()
     if len(rows) > 2 and len(rows[-1][1]) < len(names):
         # An interrupted recording ends within a line.
@@ -80,8 +82,7 @@ def _rows(text: str, path: Path) -> list[tuple[int, list[str]]]:
         raise SourceError(f"{path}: line {reader.line_num}: {fault}; fix the line") from None
 
 
-def _columns(names: list[str], path: Path) -> tuple[list[str], list[str]]:
-    """Check the header; return all names, and those of columns that are not read."""
+def _check_columns(names: list[str], path: Path) -> None:
     check_commas(names, path, SourceError)
     for name in names:
         if name in _COLUMNS and names.count(name) > 1:
@@ -97,7 +98,6 @@ def _columns(names: list[str], path: Path) -> tuple[list[str], list[str]]:
     _refuse_near_misses(names, missing, path)
     if "depth_m" in missing and "heading_deg" in missing:
         raise SourceError(f"{path}: has neither depth_m nor heading_deg; add at least one of them")
-    return names, [name for name in names if name and name not in _COLUMNS]
 
 
 def _refuse_near_misses(names: list[str], wanted: tuple[str, ...] | list[str], path: Path) -> None:
