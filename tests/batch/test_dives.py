@@ -25,7 +25,7 @@ def season(tmp_path):
     return tmp_path
 
 
-def found(*wanted, rig=None, water=None, out=None):
+def found(*wanted, rig=None, water=None, out=Path("out")):
     return find_dives([str(one) for one in wanted], rig=rig, water=water or Water(), out=out)
 
 

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 import batch_cases
-from aqualvs.batch.dataset import OF_DIVE, holds, read_manifest
+from aqualvs.batch.dataset import OF_DIVE, holds
 from aqualvs.batch.dives import DiveState
 from aqualvs.batch.scheduler import Scheduler, WorkersLostError, look
 from aqualvs.optics.rigfile import load_rig, save_rig
@@ -237,11 +237,3 @@ def test_a_fault_of_ours_fails_the_dive_alone(tmp_path, dive):
     failed = next(name for name, r in records.items() if r.state is DiveState.FAILED)
     assert records[failed].words == "ZeroDivisionError: oops"
     assert not holds(works[0].dataset, failed, OF_DIVE)
-
-
-def test_a_seal_tells_what_the_work_cost(tmp_path, dive):
-    work = work_for(tmp_path, dive)
-    season([work])
-    facts = read_manifest(work.home / "joined")["facts"]
-    assert facts["cpu_s"] > 0.0
-    assert facts["peak_bytes"] > 50e6

@@ -203,33 +203,19 @@ def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float 
 RIG_YAML = "rig.yaml"
 
 
-def find_dives(
-    wanted: Sequence[str], *, rig: Path | None, water: Water, out: Path | None = None
-) -> list[Dive]:
+def find_dives(wanted: Sequence[str], *, rig: Path | None, water: Water, out: Path) -> list[Dive]:
     """Return the dives that the user means, each once, in natural order of what was given.
 
-    Parameters
-    ----------
-    wanted : sequence of str
-        Files, folders (searched through), patterns such as `2026/*/dive*.mp4`, and lists
-        (`read_list`).
-    rig : Path or None
-        For all dives but those for which a list names another. None takes what lies beside each
-        dive: `NAME.rig.yaml` for `NAME.mp4`, else `rig.yaml` in its folder.
-    water : Water
-        Of all dives for which a list does not say better.
-    out : Path or None
-        The batch's own folder, in which no dive is looked for.
+    `wanted`: files, folders (searched through), patterns such as `2026/*/dive*.mp4`, and lists
+    (`read_list`). `rig`: of all dives but those for which a list names another; None takes what
+    lies beside each dive: `NAME.rig.yaml` for `NAME.mp4`, else `rig.yaml` in its folder. `water`:
+    of all dives for which a list does not say better. `out`: the batch's own folder, in which no
+    dive is looked for.
 
-    Raises
-    ------
-    SourceError
-        If there is no such file, a folder holds no dive, or the log of one is not there.
-    RigError
-        If a dive has no rig.
-    OptionError
-        If a dive is given twice with different rigs, water or names, a folder of dives is `out` or
-        in it, or a list cannot be read.
+    Raises `SourceError` if there is no such file, a folder holds no dive, or the log of one is not
+    there. Raises `RigError` if a dive has no rig. Raises `OptionError` if a dive is given twice
+    with different rigs, water or names, a folder of dives is `out` or in it, or a list cannot be
+    read.
     """
     found: dict[Path, Dive] = {}
     for listed in _found_dives(wanted, out):
@@ -246,7 +232,7 @@ def find_dives(
     return list(found.values())
 
 
-def _found_dives(wanted: Iterable[str], out: Path | None) -> Iterator[Dive]:
+def _found_dives(wanted: Iterable[str], out: Path) -> Iterator[Dive]:
     for text in wanted:
         for path in _expanded(text):
             if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
@@ -269,14 +255,14 @@ def _expanded(text: str) -> list[Path]:
     return found
 
 
-def _dives_in(folder: Path, out: Path | None) -> list[Path]:
+def _dives_in(folder: Path, out: Path) -> list[Path]:
     """Return the dives below a folder; without any video, each folder of images is one."""
-    own = out.resolve() if out is not None else None
-    if own is not None and folder.resolve().is_relative_to(own):
+    own = out.resolve()
+    if folder.resolve().is_relative_to(own):
         raise OptionError(f"-o {out}: is where {folder} is; choose another folder for the results")
     found = []
     for path in _visible(folder):
-        if own is not None and path.resolve().is_relative_to(own):
+        if path.resolve().is_relative_to(own):
             continue
         suffix = path.suffix.lower()
         is_dive = suffix in VIDEO_SUFFIXES and path.is_file()

@@ -7,7 +7,6 @@ written: rows and points are joined in order; the summaries of the pieces add up
 import os
 import shutil
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -79,10 +78,6 @@ class PieceResult:
     duration_s: float
     # What ended the source early; empty if nothing did.
     fault: str
-    # Spent on it, by the process that did it; 0 for one that was finished before.
-    cpu_s: float = 0.0
-    # Most memory that process had so far.
-    peak_bytes: int = 0
     # Whether it was finished before.
     reused: bool = False
 
@@ -111,24 +106,13 @@ def measure_piece(work: DiveWork, probe: DiveProbe) -> PieceResult:
     known = read_valid_manifest(folder, key)
     if known is not None:
         return PieceResult(reused=True, **known)
-    began_s = time.process_time()
     # The process has one core to itself.
     cv2.setNumThreads(1)
     with writing(folder), drafted(folder) as draft:
         with open_dive(work.request) as dive:
             facts, names = _write_piece(dive, probe.spans[0], draft, _scanner(dive, probe))
         write_manifest(draft, key, facts, names)
-    cpu_s = time.process_time() - began_s
-    return PieceResult(cpu_s=cpu_s, peak_bytes=peak_bytes(), **facts)
-
-
-def peak_bytes() -> int:
-    """Return the peak memory of this process."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such count.
-        return 0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return PieceResult(**facts)
 
 
 def _write_piece(
@@ -257,7 +241,6 @@ def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) 
     for number, piece in enumerate(pieces):
         if read_valid_manifest(piece, piece_key(probe, number)) is None:
             raise PieceLostError(f"{piece}: is damaged")
-    began_s = time.process_time()
     out, home = work.request.out, work.home
     with writing(out), scratch(home, "joining") as draft:
         _join_files(pieces, draft)
@@ -269,9 +252,6 @@ def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) 
         # That of an older result; its files in the dive's folder are gone already.
         drop(work.dataset, work.name, OF_NET)
         (home / JOINED).mkdir(parents=True, exist_ok=True)
-        cpu_s = sum(result.cpu_s for result in results) + time.process_time() - began_s
-        peak = max(peak_bytes(), *(result.peak_bytes for result in results))
-        facts |= {"cpu_s": round(cpu_s, 2), "peak_bytes": peak}
         write_manifest(home / JOINED, probe.key, facts, names, out)
     for old in home.glob("pieces-*"):
         clear(old)

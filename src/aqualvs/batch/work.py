@@ -146,11 +146,8 @@ def probe(work: DiveWork) -> DiveProbe:
                 write_manifest(folder, digest(stat), content, [])
         spans = [Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"]]
         found = DiveProbe(
-            source_key=content["source_key"],
+            **content | {"spans": tuple(spans)},
             result_key=key,
-            spans=tuple(spans),
-            why_whole=content["why_whole"],
-            n_bytes=content["n_bytes"],
             n_frames=dive.source.n_frames,
             source=source_dict(dive.source),
         )
@@ -161,7 +158,7 @@ def probe(work: DiveWork) -> DiveProbe:
 
 
 def _content(dive: OpenDive, piece_frames: int, margin: int) -> dict[str, Any]:
-    """Return what is found in the source itself, ready for JSON."""
+    """Return what a `DiveProbe` holds of the source itself, ready for JSON."""
     path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
     if isinstance(pictures, VideoSource):
         try:

@@ -7,7 +7,7 @@ from header to header, and checks and decodes only wanted frames, all of one kin
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -82,9 +82,9 @@ class Table:
     source: IntArray  # Shape (n,): sender: 256 times the system id plus the component id.
     payload: np.ndarray  # Shape (n,): fields as in `MESSAGES`.
 
-    def __getitem__(self, mask: BoolArray) -> "Table":
-        """Return the frames marked by a mask (n,)."""
-        return Table(self.at[mask], self.received_us[mask], self.source[mask], self.payload[mask])
+    def __getitem__(self, rows: BoolArray | IntArray) -> "Table":
+        """Return the frames marked by a mask (n,), or with these numbers, in their order."""
+        return Table(self.at[rows], self.received_us[rows], self.source[rows], self.payload[rows])
 
 
 class SelectedMessages(NamedTuple):
@@ -109,14 +109,16 @@ def read_frames(data: bytes) -> SelectedMessages:
     """
     places, n_frames, skipped = _scan(data)
     octets = np.frombuffer(data, np.uint8)
-    tables: dict[str, Table] = {}
+    tables: dict[str, list[Table]] = defaultdict(list)
     n_failed = 0
     for (number, magic), starts in places.items():
         at = np.array(starts, np.int64)
         table, sound = _decode(octets, at, MESSAGES[number], magic)
         n_failed += int(np.count_nonzero(~sound))
-        _merge(tables, MESSAGES[number].name, table[sound])
-    return SelectedMessages(tables, n_frames, n_failed, tuple(skipped))
+        if sound.any():
+            tables[MESSAGES[number].name].append(table[sound])
+    joined = {name: _joined(versions) for name, versions in tables.items()}
+    return SelectedMessages(joined, n_frames, n_failed, tuple(skipped))
 
 
 def _scan(data: bytes) -> tuple[dict[tuple[int, int], list[int]], int, list[tuple[int, int]]]:
@@ -236,14 +238,8 @@ def _crc_table() -> np.ndarray:
 _CRC = _crc_table()
 
 
-def _merge(tables: dict[str, Table], name: str, table: Table) -> None:
-    """Add frames of the other version of MAVLink, in the order of the file."""
-    if not len(table.at):
-        return
-    known = tables.get(name)
-    if known is None:
-        tables[name] = table
-        return
-    order = np.argsort(np.concatenate([known.at, table.at]), kind="stable")
-    pairs = ((getattr(one, f.name) for one in (known, table)) for f in fields(Table))
-    tables[name] = Table(*(np.concatenate([*pair])[order] for pair in pairs))
+def _joined(versions: Sequence[Table]) -> Table:
+    """Return the frames of both versions of MAVLink, in the order of the file."""
+    columns = ([getattr(one, f.name) for one in versions] for f in fields(Table))
+    joined = Table(*map(np.concatenate, columns))
+    return joined[np.argsort(joined.at, kind="stable")]
