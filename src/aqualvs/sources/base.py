@@ -1,13 +1,4 @@
-"""Interfaces of all sources of frames, and their common parts.
-
-- `FrameSource`: frames in order, all of the same size; for `run`.
-- `Feed`: the frames of a live run, from a stream that may stall, change its size or return.
-- `Health`, `PartHealth`, `StageDelay`: rates, delays and drops of a live run, and the state of its
-  lasers and links.
-- `planes_of`: luma and chroma of a decoded picture, not copied where its layout allows;
-  `bgr_of`: a frame as a colour picture for overlays and viewers.
-- `packet_with`: a packet for a decoder, from bytes that FFmpeg has not read itself.
-"""
+"""Interfaces of all sources of frames, `FrameSource` and `Feed`, and their common parts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

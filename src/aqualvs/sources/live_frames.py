@@ -1,10 +1,4 @@
-"""Numbered, timed frames from the packets of a live stream.
-
-- `LiveFrames`: frames over reconnections and senders that start anew.
-- `LiveDecoder`: a decoder without delay that delivers undamaged pictures only.
-- `StreamClock`, `Unwrapper`: time since the start of the stream, from the stream's own clock.
-- `Reception`: the state of the reception, as shown to the pilot.
-"""
+"""Numbered, timed frames from the packets of a live stream, and the state of its reception."""
 
 import statistics
 import threading

@@ -1,9 +1,4 @@
-"""A vehicle's log of its own motion: signals over time, and position and bearing at dive times.
-
-- `VehicleLog`: all signals on one clock, and faults of the file.
-- `Signal`: one quantity with its own time stamps, interpolated except across gaps.
-- `Places`: depth, heading and the net's bearing at dive times.
-"""
+"""A vehicle's log of its own motion: signals over time, and position and bearing at dive times."""
 
 import datetime
 import math

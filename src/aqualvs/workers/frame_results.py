@@ -1,11 +1,4 @@
-"""Results of frames, a few frames at a time: measurement with and without the dome, in blocks.
-
-- `FrameProcessor`: measures blocks of consecutive frames.
-- `BareLensComparison`: the posture from the same stripe points, triangulated as if by a bare lens:
-  the error of ignoring the dome.
-- `corrected_rows`: the correction of a rolling shutter, by the frames beside each.
-- `in_blocks`, `read_ahead`: blocks of frames, and a thread that reads them ahead.
-"""
+"""Results of frames, a few frames at a time: measurement with and without the dome, in blocks."""
 
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
@@ -39,7 +32,8 @@ class BareLensComparison:
     """Measurement of a scan's posture with the rig's camera out of its housing.
 
     Detection, classification and the choice of the target are taken over from the scan, so that
-    the difference is that of the ray model alone (paper, section 5.4).
+    the difference is that of the ray model alone: the error of ignoring the dome (paper, section
+    5.4).
 
     `rig`: a rig with a housing.
     """
