@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,8 +16,10 @@ from aqualvs.control.vehicle import VehicleState
 from aqualvs.errors import SourceError
 from aqualvs.live import runner as live_runner
 from aqualvs.live.health_monitor import FrozenOptions
+from aqualvs.live.outputs.base import Output
 from aqualvs.live.runner import Arrival, LiveOptions, LiveRunner, Mailbox, ScannerProvider
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
+from aqualvs.recording import DiveRecording, Recorder
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.row_motion import RowMotion
@@ -51,7 +54,7 @@ def after(seconds: float) -> Callable[[], bool]:
 
 def runner(
     steps: list[Step],
-    *outputs: Collector,
+    *outputs: Output,
     endless: bool = False,
     keep_every: bool = False,
     scanner: object = None,
@@ -221,6 +224,14 @@ def test_a_source_faster_than_the_pipeline_costs_frames_but_no_delay(
     measured = [s for s in output.samples if s.frame is not None]
     assert [s.scan.index for s in measured] == [0, 399]
     assert (measured[-1].health.n_dropped, measured[-1].health.n_lost) == (398, 0)
+
+
+def test_a_recorder_as_an_output_records_from_the_start(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "dive.mcap")
+    frames = [renumbered(FRAME, index) for index in range(3)]
+    runner(frames, recorder, keep_every=True).run(never)
+    found = DiveRecording(recorder.path).frames(with_pictures=False)
+    assert [one.index for one in found] == [0, 1, 2]
 
 
 def test_silence_is_told_within_a_fifth_of_a_second_and_ends_with_the_next_frame(

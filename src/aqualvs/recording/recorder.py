@@ -129,6 +129,8 @@ class Recorder:
     """
 
     name = "recorder"
+    inline = False
+    keeps_all = True
 
     def __init__(
         self,
