@@ -8,7 +8,6 @@ known.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,21 +22,9 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.expected_error import WallView
 from aqualvs.optics.rig import Laser, Rig, rig_moved_by
 
-
-class _BoardOptions(NamedTuple):
-    """Boards for the calibration of lasers, and points on their stripes."""
-
-    # Ranges of the boards, as exponents between the ends of the working range.
-    places: tuple[float, float] = (0.15, 0.85)
-    # Corners to a side, and half a side as a share of the range, such that boards fill the picture.
-    n_corners: int = 11
-    half_board: float = 0.8
-    # Points along a stripe, and fewest visible points of a laser on all boards.
-    n_points: int = 161
-    min_points: int = 40
-
-
-_BOARD = _BoardOptions()
+# Half a side of a board for the calibration of lasers, as a share of its range: boards fill the
+# picture.
+_HALF_BOARD = 0.8
 
 
 def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
@@ -97,7 +84,8 @@ def lasers_by(assumed: Rig, true: Rig) -> Rig | None:
             continue
         for points, laser in zip(lit, true.lasers, strict=True):
             points.append(_stripe_on(board, found, laser, assumed, true))
-    if any(sum(map(len, points)) < _BOARD.min_points for points in lit):
+    min_points = 40  # Fewest visible points of a laser on all boards.
+    if any(sum(map(len, points)) < min_points for points in lit):
         return None
     lasers = (
         replace(laser, plane=Plane.fitted(np.concatenate(points)), window=None)
@@ -109,9 +97,10 @@ def lasers_by(assumed: Rig, true: Rig) -> Rig | None:
 def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
     """Yield poses `dome_from_board`; boards lie in their x-z plane."""
     near, far = working_range
+    places = (0.15, 0.85)  # Exponents between the ends of the working range.
     # Rotation vectors.
     tilts = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
-    for share in _BOARD.places:
+    for share in places:
         middle = np.array([0.0, near * (far / near) ** share, 0.0])
         for tilt in tilts:
             yield SE3(rotation_from_rotvec(tilt), middle)
@@ -119,8 +108,8 @@ def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
 
 def _estimated_pose(assumed: Rig, true: Rig, board: SE3) -> SE3 | None:
     """Return the pose of a board that the assumed camera estimates; None if it fails."""
-    half = _BOARD.half_board * float(board.translation[1])
-    x, z = np.meshgrid(*(np.linspace(-half, half, _BOARD.n_corners),) * 2)
+    half, n_corners = _HALF_BOARD * float(board.translation[1]), 11
+    x, z = np.meshgrid(*(np.linspace(-half, half, n_corners),) * 2)
     corners = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
     camera = true.camera()
     pixels, valid = camera.project(board.apply(corners))
@@ -146,8 +135,8 @@ def _stripe_on(board: SE3, found: SE3, laser: Laser, assumed: Rig, true: Rig) ->
     rows = np.stack([laser.plane.normal, face, along / length])
     middle = board.translation
     start = np.linalg.solve(rows, [laser.plane.offset, face @ middle, rows[2] @ middle])
-    half = _BOARD.half_board * float(middle[1])
-    points = start + np.linspace(-half, half, _BOARD.n_points)[:, None] * rows[2]
+    half, n_points = _HALF_BOARD * float(middle[1]), 161
+    points = start + np.linspace(-half, half, n_points)[:, None] * rows[2]
     camera = true.camera()
     pixels, valid = camera.project(points)
     on_board = np.abs(board.inverse().apply(points)) <= half

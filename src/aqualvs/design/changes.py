@@ -232,20 +232,13 @@ def _centred(design: Design) -> Design | None:
     return replace(design, rig=replace(design.rig, dome_from_cam=centred))
 
 
-def _averaged(design: Design) -> Design:
-    """Average four frames with stripes at different places of the target: the noise halves.
+def _halved(part: str, *names: str) -> Callable[[Design], Design]:
+    """Return the change that halves these numbers of a part of the design."""
 
-    The shift of the light on twine does not: it depends on twine and water, not on the place.
-    """
-    noise = design.noise
-    halved = {name: 0.5 * getattr(noise, name) for name in ("point", "strand", "shared")}
-    return replace(design, noise=replace(noise, **halved))
-
-
-def _better_known(*names: str) -> Callable[[Design], Design]:
     def change(design: Design) -> Design:
-        halved = {name: 0.5 * getattr(design.tolerances, name) for name in names}
-        return replace(design, tolerances=replace(design.tolerances, **halved))
+        before = getattr(design, part)
+        halved = {name: 0.5 * getattr(before, name) for name in names}
+        return replace(design, **{part: replace(before, **halved)})
 
     return change
 
@@ -271,8 +264,10 @@ _CHANGES: dict[str, Callable[[Design], Design | None]] = {
         design, lambda mount: replace(mount, fan=math.radians(90.0))
     ),
     "lens in the dome's centre": _centred,
-    "mean of four frames": _averaged,
-    "lasers known twice as well": _better_known("laser_angle", "laser_offset"),
-    "water's index known twice as well": _better_known("n_water"),
+    # Of frames with stripes at different places of the target. The shift of the light on twine
+    # stays: it depends on twine and water, not on the place.
+    "mean of four frames": _halved("noise", "point", "strand", "shared"),
+    "lasers known twice as well": _halved("tolerances", "laser_angle", "laser_offset"),
+    "water's index known twice as well": _halved("tolerances", "n_water"),
     "working range ends 20 % nearer": _nearer,
 }

@@ -121,13 +121,13 @@ def _print_verdict(
     if exists:
         now, tilted = camera_errors(design, ranges), first
         first, fine = verdict(design, now)
-        output.headline(first)
+        output.say(first, "bold")
         output(f"Its lasers tilted best: {tilted}", *summary(best))
         _print_errors(output, design, now, f"As it is: {square}")
         output(gain_text(design, best))
         _print_errors(output, best, by_camera, f"Tilted best: {square}")
     else:
-        output.headline(first)
+        output.say(first, "bold")
         output(*summary(best))
         _print_errors(output, best, by_camera, f"Expected error: {square}")
     return first, fine, by_camera
@@ -147,13 +147,9 @@ class _Output:
         self.console.print()
         self.parts += parts
 
-    def headline(self, verdict: str) -> None:
-        """Print the first line, which the page shows separately."""
-        self.console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)
-
-    def say(self, sentence: str) -> None:
-        """Print a line that the page does not repeat."""
-        self.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+    def say(self, sentence: str, style: str | None = None) -> None:
+        """Print a line that the page does not repeat among its parts."""
+        self.console.print(sentence, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def _print_errors(

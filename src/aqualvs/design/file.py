@@ -232,10 +232,8 @@ def design_from(content: object, *, name: str, folder: Path) -> Design:
     file = parse_settings(content, DesignFile, KEY, VERSION, name)
     try:
         return _design(file, folder)
-    except RigError as fault:
-        raise RigError(f"{name}: {fault}") from None
-    except OptionError as fault:
-        raise OptionError(f"{name}: {fault}") from None
+    except (OptionError, RigError) as fault:
+        raise type(fault)(f"{name}: {fault}") from None
 
 
 def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
@@ -328,13 +326,9 @@ def _mounts(file: DesignFile) -> tuple[Mount, ...]:
     if (lasers is None) == (mounts is None):
         raise OptionError("write either 'lasers' (evenly round the dome) or 'mounts' (one by one)")
     if lasers is not None:
-        placed = ring(
-            lasers.count,
-            lasers.baseline_mm / _MM,
-            lasers.back_mm / _MM,
-            math.radians(lasers.fan_deg),
-        )
-        return tuple(replace(mount, free_stripe=lasers.turn_stripes) for mount in placed)
+        values = si_values(lasers)
+        turn = values.pop("turn_stripes")
+        return tuple(replace(mount, free_stripe=turn) for mount in ring(**values))
     assert mounts is not None
     names = [part.name for part in mounts]
     if len(set(names)) < len(names):

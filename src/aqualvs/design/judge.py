@@ -73,7 +73,7 @@ def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) 
         net=_sigmas(posture_covariance(mesh, walls)),
         systematic=_systematic(stripes, design.tolerances, walls),
         strands=stripes.length * design.net.strands_per_metre,
-        crossing=crossings(stripes),
+        crossing=cross(stripes, stripes),
     )
 
 
@@ -170,15 +170,11 @@ def posture_covariance(sums: Sums, ranges: FloatArray) -> FloatArray:
     return picked * scale[..., :, None] * scale[..., None, :]
 
 
-def crossings(stripes: Stripes) -> BoolArray:
-    """Return the mask (K, K, W) of stripes that cross within the picture."""
-    crossing: BoolArray = cross(stripes, stripes)
-    crossing[np.arange(len(crossing)), np.arange(len(crossing))] = False
-    return crossing
-
-
 def cross(one: Stripes, other: Stripes) -> BoolArray:
-    """Return the mask (K, L, W) of stripes of two sets that cross within their visible parts."""
+    """Return the mask (K, L, W) of stripes of two sets that cross within their visible parts.
+
+    No stripe crosses itself.
+    """
     e, f = one.along[:, None, None], other.along[None, :, None]
     apart = other.centre[None] - one.centre[:, None]
     sine = _cross_xz(e, f)
@@ -198,12 +194,14 @@ def _systematic(
     stripes: Stripes, tolerances: Tolerances, ranges: FloatArray
 ) -> dict[str, FloatArray]:
     """Return standard deviations (W, 3) by cause."""
+    angles = stripes.own[..., 2:4, :] * tolerances.laser_angle
+    offsets = stripes.own[..., 4:, :] * tolerances.laser_offset
+    scatters = {
+        "water index": outer(stripes.common.sum(axis=0)),
+        "laser angles": outer(angles).sum(axis=0),
+        "laser offsets": outer(offsets).sum(axis=0),
+    }
     matrix = stripes.matrix.sum(axis=0)
-    scatters = {"water index": outer(stripes.common.sum(axis=0))}
-    angle = np.array([tolerances.laser_angle] * 2)[:, None]
-    offset = np.array([tolerances.laser_offset])[:, None]
-    scatters["laser angles"] = outer(stripes.own[..., 2:4, :] * angle).sum(axis=0)
-    scatters["laser offsets"] = outer(stripes.own[..., 4:, :] * offset).sum(axis=0)
     return {
         cause: _sigmas(posture_covariance(Sums(matrix, scatter), ranges))
         for cause, scatter in scatters.items()

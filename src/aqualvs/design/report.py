@@ -19,6 +19,7 @@ from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost
 from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
 from aqualvs.design.settings import Design
+from aqualvs.design.stripes import points_along
 from aqualvs.geometry.arrays import BoolArray, FloatArray, runs_of
 from aqualvs.report import html
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas, save_figures
@@ -449,8 +450,7 @@ def _stripe_pixels(design: Design, ranges: FloatArray) -> FloatArray:
     share = np.linspace(0.0, 1.0, _N_ALONG)
     begin, end = stripes.ends[..., :1], stripes.ends[..., 1:]
     place = begin + share * (end - begin)
-    along = stripes.along[:, None, None, :]
-    points = stripes.centre[:, :, None, :] + place[..., None] * along
+    points = points_along(stripes.centre, stripes.along, place)
     pixels, _ = design.rig.camera().project(points)
     return pixels
 

@@ -99,7 +99,7 @@ def _visible_ends(
     # The first pass covers the whole fan, which may be much wider than the picture.
     for _ in range(_N_PASSES):
         place = fan[..., :1] + share * (fan[..., 1:] - fan[..., :1])
-        pixels, valid = camera.project(_points(centre, along, place))
+        pixels, valid = camera.project(points_along(centre, along, place))
         x, y = pixels[..., 0] + 0.5 - margin, pixels[..., 1] + 0.5 - margin
         # Distance to the picture's border in pixels, negative outside; NaN if not seen.
         inside = np.minimum(np.minimum(x, width - free - x), np.minimum(y, height - free - y))
@@ -115,7 +115,8 @@ def _visible_ends(
     return np.where(some[..., None], np.stack([begin, end], axis=-1), np.nan)
 
 
-def _points(centre: FloatArray, along: FloatArray, place: FloatArray) -> FloatArray:
+def points_along(centre: FloatArray, along: FloatArray, place: FloatArray) -> FloatArray:
+    """Return the points (K, W, S, 3) at `place` (K, W, S), in metres, along stripes' lines."""
     return centre[..., None, :] + place[..., None] * along[:, None, None, :]
 
 
@@ -148,7 +149,7 @@ def _summed(
     """Integrate the sums over the visible parts of stripes; see `Stripes`. Beams: shape (K, 3)."""
     node, weight = np.polynomial.legendre.leggauss(_N_SUM)
     half = 0.5 * (ends[..., 1:] - ends[..., :1])
-    points = _points(centre, along, 0.5 * ends.sum(axis=-1, keepdims=True) + half * node)
+    points = points_along(centre, along, 0.5 * ends.sum(axis=-1, keepdims=True) + half * node)
     pixels, valid, by_point, by_parameter = camera.project_with_parameter_jacobian(points)
     seen: BoolArray = np.asarray(valid.all(axis=-1))
     path = np.einsum("kwsij,kj->kwsi", by_point, along)
@@ -158,8 +159,8 @@ def _summed(
     lines = np.abs(np.where(is_row, path[..., 1], path[..., 0])) * (weight * half)
     lines = lines / pixels_per_line(camera.size_px)
     normal = np.cross(along, beam)
-    sensitivity = _Sensitivity.of(normal, ranges, by_point, by_parameter @ common)
-    per_px = np.where(is_row, sensitivity.by_x, sensitivity.by_y)
+    by_x, by_y, by_normal, by_common = _sensitivity(normal, ranges, by_point, by_parameter @ common)
+    per_px = np.where(is_row, by_x, by_y)
     # Positions along the stripe, from -1 at one border of the picture to 1 at the other.
     x, y = (2.0 * pixels[..., i] / (camera.size_px[i] - 1) - 1.0 for i in range(2))
     place = np.where(is_row, y, x)
@@ -169,10 +170,10 @@ def _summed(
     weighted = line_weight[..., None] * np.where(np.isfinite(points), points, 0.0)
     # A normal that turns towards t moves the sheet by -t·X along the old normal.
     turned = -np.stack([np.einsum("kwsi,ki->kws", points, t) for t in (along, beam)], axis=-1)
-    by_normal = sensitivity.by_normal[..., None]
     pixel = np.stack([per_px, per_px * place], axis=-1)
-    by_error = np.concatenate([pixel, turned * by_normal, by_normal], axis=-1)
-    safe = [np.where(np.isfinite(a), a, 0.0) for a in (points, by_error, sensitivity.by_common)]
+    by_offset = by_normal[..., None]
+    by_error = np.concatenate([pixel, turned * by_offset, by_offset], axis=-1)
+    safe = [np.where(np.isfinite(a), a, 0.0) for a in (points, by_error, by_common)]
     return Stripes(
         lines=np.where(seen, lines.sum(axis=-1), 0.0),
         length=np.where(seen, 2.0 * half[..., 0], 0.0),
@@ -185,35 +186,26 @@ def _summed(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Sensitivity:
-    """Derivatives of m·X at the points (K, W, S) that fixed pixels triangulate to."""
+def _sensitivity(
+    normals: FloatArray, ranges: FloatArray, by_point: FloatArray, steps: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the derivatives of m·X at the points (K, W, S) that fixed pixels triangulate to.
 
-    # Shape (K, W, S): by the pixel, in 1/px.
-    by_x: FloatArray
-    by_y: FloatArray
-    # Shape (K, W, S): by a step of the sheet along its normal, in 1/m.
-    by_normal: FloatArray
-    # Shape (K, W, S, G): by the camera's errors.
-    by_common: FloatArray
-
-    @classmethod
-    def of(
-        cls, normals: FloatArray, ranges: FloatArray, by_point: FloatArray, steps: FloatArray
-    ) -> "_Sensitivity":
-        """Solve [J; n] dX = (du, dv, dn) for m·dX, with the inverse by cross products."""
-        row_x, row_y = by_point[..., 0, :], by_point[..., 1, :]
-        normal = normals[:, None, None, :]
-        # Only the forward part of dX changes m·X = y / range.
-        x_n, n_y = _cross_y(row_y, normal), _cross_y(normal, row_x)
-        across = np.cross(row_x, row_y)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y, z = (normal[..., i] * across[..., i] for i in range(3))
-            volume = (x + y + z) * ranges[None, :, None]
-            by_x, by_y, by_normal = x_n / volume, n_y / volume, across[..., 1] / volume
-            # At a fixed pixel a step of the camera acts like the opposite step of the pixel.
-            by_common = -(by_x[..., None] * steps[..., 0, :] + by_y[..., None] * steps[..., 1, :])
-        return cls(by_x, by_y, by_normal, by_common)
+    By a pixel's x and y, in 1/px; by a step of the sheet along its normal, in 1/m; and, shape
+    (K, W, S, G), by the camera's errors. [J; n] dX = (du, dv, dn) is solved by cross products.
+    """
+    row_x, row_y = by_point[..., 0, :], by_point[..., 1, :]
+    normal = normals[:, None, None, :]
+    # Only the forward part of dX changes m·X = y / range.
+    x_n, n_y = _cross_y(row_y, normal), _cross_y(normal, row_x)
+    across = np.cross(row_x, row_y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y, z = (normal[..., i] * across[..., i] for i in range(3))
+        volume = (x + y + z) * ranges[None, :, None]
+        by_x, by_y, by_normal = x_n / volume, n_y / volume, across[..., 1] / volume
+        # At a fixed pixel a step of the camera acts like the opposite step of the pixel.
+        by_common = -(by_x[..., None] * steps[..., 0, :] + by_y[..., None] * steps[..., 1, :])
+    return by_x, by_y, by_normal, by_common
 
 
 def _cross_y(a: FloatArray, b: FloatArray) -> FloatArray:
