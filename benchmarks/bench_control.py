@@ -17,6 +17,7 @@ from benchmarks.random_dives import DiveResult, random_dives
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
 from aqualvs.control.safety import SafetyLimits
+from aqualvs.control.tune import tune
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.follow.case import (
     FROM_REST_S,
@@ -27,7 +28,6 @@ from aqualvs.follow.case import (
     SimCase,
     Trials,
     sea,
-    tuned_gains,
     vehicle_model,
 )
 from aqualvs.follow.log import LoopLog, effort_measures, hold_measures, step_measures
@@ -54,7 +54,7 @@ def run() -> list[dict[str, Any]]:
 def _trials(name: str, *, rendered: bool) -> list[dict[str, Any]]:
     """Return the worst of all seeds, and the step of their mean."""
     model = vehicle_model(name)
-    gains, fps = tuned_gains(model), 12.5 if rendered else 25.0
+    gains, fps = tune(model).gains, 12.5 if rendered else 25.0
     seeds = _SEEDS[:1] if rendered else _SEEDS
     each = [Trials(model, gains, rendered=rendered, fps=fps, seed=seed) for seed in seeds]
     runs = [one.hold_and_step() for one in each]
@@ -105,7 +105,7 @@ def _held(model: VehicleModel, water: WaterMotion) -> LoopLog:
 
 def _dives(name: str, n: int) -> list[dict[str, Any]]:
     model = vehicle_model(name, pilot_gain=1.0)
-    found = list(random_dives(model, tuned_gains(model), range(n), workers=2))
+    found = list(random_dives(model, tune(model).gains, range(n), workers=2))
 
     def count(of: list[bool]) -> float:
         return float(sum(of))

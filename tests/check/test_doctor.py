@@ -5,13 +5,14 @@ import io
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from aqualvs.check import doctor
 from aqualvs.check import doctor as doctor_autopilot
-from aqualvs.check.doctor import _EXTRAS, DoctorRequest, run_doctor
+from aqualvs.check.doctor import _EXTRAS, run_doctor
 from aqualvs.errors import AqualvsError
 from aqualvs.text import Finding
 from field_cases import interlaced_rig, woven_dive
@@ -23,11 +24,11 @@ MEASURE = doctor._speed
 DEMO = Path(doctor.__file__).parents[1] / "data" / "demo"
 
 
-def told(request: DoctorRequest, fault: str | None = None) -> str:
+def told(fault: str | None = None, **checked: Any) -> str:
     """What is printed; with `fault`, what is refused in the end must match it."""
     text = io.StringIO()
     with contextlib.nullcontext() if fault is None else pytest.raises(AqualvsError, match=fault):
-        run_doctor(request, Console(file=text, width=200))
+        run_doctor(**checked, console=Console(file=text, width=200))
     return text.getvalue()
 
 
@@ -39,15 +40,14 @@ def no_dive_measured(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_this_machine_decodes_and_measures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_speed", MEASURE)
-    text = told(DoctorRequest())
+    text = told()
     assert "H.264 decoded: 40 frames" in text
     assert "posture in 39 of 40 frames" in text or "posture in 40 of 40 frames" in text
 
 
 def test_a_source_that_fits_the_rig(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_STREAM_S", 2.0)
-    request = DoctorRequest(source=str(DEMO / "dive.mp4"), rig=DEMO / "rig.yaml")
-    text = told(request)
+    text = told(source=str(DEMO / "dive.mp4"), rig=DEMO / "rig.yaml")
     assert "720x576 px" in text
     # A busy machine does not keep up with a recording that comes at its own pace.
     assert re.search(r" \d+ lost", text)
@@ -59,41 +59,41 @@ def test_fields_that_the_rig_says_nothing_of_are_told(
     monkeypatch.setattr(doctor, "_STREAM_S", 2.0)
     dive, rig = woven_dive(tmp_path / "dive.mp4", 12), interlaced_rig(tmp_path / "rig.yaml")
     wrong = "camera.shutter: {kind: interlaced, readout_ms: 40}"
-    assert wrong in told(DoctorRequest(source=str(dive), rig=DEMO / "rig.yaml"))
-    assert wrong in told(DoctorRequest(source=str(dive)))
-    text = told(DoctorRequest(source=str(dive), rig=rig))
+    assert wrong in told(source=str(dive), rig=DEMO / "rig.yaml")
+    assert wrong in told(source=str(dive))
+    text = told(source=str(dive), rig=rig)
     assert wrong not in text
     assert re.search(r"posture in \d+ of \d*[02468] frames with the rig", text)
-    assert "take camera.shutter out" in told(DoctorRequest(source=str(DEMO / "dive.mp4"), rig=rig))
+    assert "take camera.shutter out" in told(source=str(DEMO / "dive.mp4"), rig=rig)
 
 
 def test_silence_is_not_ready_and_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_STREAM_S", 0.5)
     monkeypatch.setattr(doctor_autopilot, "_HEARTBEAT_S", 0.5)
     port = free_port()
-    request = DoctorRequest(source=f"udp://127.0.0.1:{port}", mavlink="udpin:127.0.0.1:0")
-    text = told(request, fault=f"not ready: udp://127.0.0.1:{port}: no picture in")
+    address, fault = f"udp://127.0.0.1:{port}", f"not ready: udp://127.0.0.1:{port}: no picture in"
+    text = told(source=address, mavlink="udpin:127.0.0.1:0", fault=fault)
     assert "no heartbeat of an autopilot" in text
 
 
 def test_a_missing_file_and_another_size_are_told(tmp_path: Path) -> None:
-    assert "none.mp4" in told(DoctorRequest(source=str(tmp_path / "none.mp4")), fault="none.mp4")
+    assert "none.mp4" in told(source=str(tmp_path / "none.mp4"), fault="none.mp4")
 
 
 def test_a_file_that_is_cut_short_is_told(tmp_path: Path) -> None:
     dive = write_video(tmp_path / "dive.mp4", 10, size=(96, 64), mux={"movflags": "faststart"})
     cut_after(dive, 5)
-    text = told(DoctorRequest(source=str(dive)), fault="only 5 of 10 frames")
+    text = told(source=str(dive), fault="only 5 of 10 frames")
     assert "96x64 px" in text
 
 
 def test_a_rig_is_read_also_where_nothing_is_to_fit_it(tmp_path: Path) -> None:
-    told(DoctorRequest(rig=tmp_path / "none.yaml"), fault="none.yaml: no such file")
+    told(rig=tmp_path / "none.yaml", fault="none.yaml: no such file")
 
 
 def test_a_package_that_is_missing_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_installed", lambda _name: False)
-    text = told(DoctorRequest())
+    text = told()
     for extra in _EXTRAS:
         assert f"pip install 'aqualvs[{extra}]'" in text
 

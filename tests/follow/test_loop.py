@@ -12,9 +12,10 @@ from benchmarks.random_dives import random_dive
 from aqualvs.control.answer_watch import AnswerLimits
 from aqualvs.control.missions import HoldMission
 from aqualvs.control.safety import LimitReason as GateReason
+from aqualvs.control.tune import tune
 from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError
-from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
+from aqualvs.follow.case import SimCase, sea, vehicle_model
 from aqualvs.follow.log import NEUTRAL_WITHIN_S, LoopLog, LoopRow, write_log
 from aqualvs.follow.loop import SimulatedLoop, Timing
 from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledSensor
@@ -23,7 +24,7 @@ from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.vehicle.water_motion import WaterMotion
 
 MODEL = vehicle_model("bluerov2")
-GAINS = tuned_gains(MODEL)
+GAINS = tune(MODEL).gains
 CALM = SimCase(model=MODEL, gains=GAINS, water=WaterMotion())
 ROUGH = replace(CALM, water=sea(seed=3))
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from aqualvs.control.missions import HoldMission
+from aqualvs.control.tune import tune
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow import sensor_model
-from aqualvs.follow.case import SimCase, tuned_gains, vehicle_model
+from aqualvs.follow.case import SimCase, vehicle_model
 from aqualvs.follow.command import Aim, SimRequest
 from aqualvs.follow.loop import Timing
 from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
@@ -65,7 +66,7 @@ def test_fields_are_frames_each_of_its_own_time():
 
 def test_the_first_field_of_a_picture_waits_for_the_second():
     model = vehicle_model("bluerov2")
-    case = SimCase(model=model, gains=tuned_gains(model), timing=Timing(fps=50.0, field=0.02))
+    case = SimCase(model=model, gains=tune(model).gains, timing=Timing(fps=50.0, field=0.02))
     loop = case.loop(SampledSensor(case.net, np.random.default_rng(1)), HoldMission(Setpoint(0.6)))
     steps = []
     loop.on_step = lambda now_s, frame_s, *_: steps.append((now_s, frame_s))

@@ -11,7 +11,7 @@ from aqualvs.control.gains_file import VEHICLES as PACKAGED
 from aqualvs.control.gains_file import gains_text, load_gains
 from aqualvs.control.tune import Loop, Tuned, TuneOptions, facts_of, margins, tune, usable_gains
 from aqualvs.errors import OptionError
-from aqualvs.follow.tune import StepOptions, TuneRequest, run_tune, simulate_step
+from aqualvs.follow.tune import StepOptions, run_tune, simulate_step
 from aqualvs.simulation.vehicle.models import BLUEROV2, BLUEROV2_HEAVY, VEHICLES, VIDEORAY
 
 
@@ -118,20 +118,20 @@ def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(OptionError, match="delay"):
         TuneOptions(delay=0.3, greatest_delay=0.2)
     with pytest.raises(OptionError, match="no such model"):
-        run_tune(TuneRequest(model="submarine"), print)
+        run_tune("submarine", print)
 
 
 def test_report_says_margins_and_steps(tmp_path: Path) -> None:
     lines: list[str] = []
     path = tmp_path / "gains.yaml"
-    run_tune(TuneRequest(model="bluerov2", output=path), lines.append)
+    run_tune("bluerov2", lines.append, output=path)
     text = "\n".join(lines)
     assert text.count("range") == 3
     assert "range  200 ms, worst" in text
     assert text.count("overshoot") == 2
     assert load_gains(path).vehicle.name == "bluerov2"
     printed: list[str] = []
-    run_tune(TuneRequest(model="bluerov2"), printed.append)
+    run_tune("bluerov2", printed.append)
     assert printed[-1] == path.read_text()
 
 

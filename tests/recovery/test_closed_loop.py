@@ -14,18 +14,10 @@ from benchmarks.random_dives import DiveResult, dive_and_measure, random_dive, r
 
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
+from aqualvs.control.tune import tune
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.follow import sensor_model
-from aqualvs.follow.case import (
-    FROM_REST_S,
-    RANGE,
-    STEP,
-    STEP_S,
-    SimCase,
-    Trials,
-    tuned_gains,
-    vehicle_model,
-)
+from aqualvs.follow.case import FROM_REST_S, RANGE, STEP, STEP_S, SimCase, Trials, vehicle_model
 from aqualvs.follow.log import effort_measures, hold_measures, step_measures
 from aqualvs.follow.sensor_model import SampledSensor
 from quick_pictures import QuickRenderer
@@ -112,14 +104,14 @@ def test_follows_a_curved_net_that_moves(name: str) -> None:
 def dived(name: str, seed: int) -> DiveResult:
     # A full stick is full thrust: half of it does not hold every drag and current drawn here.
     model = vehicle_model(name, pilot_gain=1.0)
-    return dive_and_measure(random_dive(model, tuned_gains(model), seed))
+    return dive_and_measure(random_dive(model, tune(model).gains, seed))
 
 
 @BOTH
 def test_random_dives_are_safe(name: str) -> None:
     if N_RUNS:
         model = vehicle_model(name, pilot_gain=1.0)
-        found = list(random_dives(model, tuned_gains(model), range(N_RUNS // 2)))
+        found = list(random_dives(model, tune(model).gains, range(N_RUNS // 2)))
     else:
         any_kind = SEEDS_OF_ANY_KIND[name][: None if WHOLE else 1]
         found = [dived(name, seed) for seed in (*any_kind, *HARD_SEEDS[name])]

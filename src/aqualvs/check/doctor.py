@@ -14,7 +14,6 @@ import shutil
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -191,31 +190,29 @@ _N_FRAMES, _FRAME_RATE = 40, 25.0
 _STREAM_S = 8.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DoctorRequest:
-    """Things to check beyond the machine itself: stream, rig, autopilot."""
+def run_doctor(
+    source: str | None = None,
+    rig: Path | None = None,
+    mavlink: str | None = None,
+    vehicle: VehicleSetup | None = None,
+    console: Console | None = None,
+) -> None:
+    """Check the machine, a rig file, a stream and an autopilot; print the findings.
 
-    source: str | None = None  # Stream, camera or file.
-    rig: Path | None = None  # Rig that the pictures should fit.
-    mavlink: str | None = None  # Address of an autopilot.
-    # Expected systems, and options of steering.
-    vehicle: VehicleSetup = field(default_factory=VehicleSetup)
-
-
-def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
-    """Run all checks and print their findings.
+    `source`: a stream, camera or file, whose pictures should fit the rig, if both are given.
+    `mavlink`: address of the autopilot. `vehicle`: expected systems, and options of steering.
 
     Raises `AqualvsError` with the first bad finding, after all checks.
     """
     console = console or Console()
     console.print(f"aqualvs {__version__}", style="bold", highlight=False)
     checks: list[Callable[[], Iterator[Finding]]] = [_machine, _packages, _pipeline]
-    if request.rig is not None:
-        checks.append(partial(_rig_file, request.rig))
-    if request.source is not None:
-        checks.append(partial(_stream, request.source, request.rig))
-    if request.mavlink is not None:
-        checks.append(partial(autopilot, request.mavlink, request.vehicle, request.rig))
+    if rig is not None:
+        checks.append(partial(_rig_file, rig))
+    if source is not None:
+        checks.append(partial(_stream, source, rig))
+    if mavlink is not None:
+        checks.append(partial(autopilot, mavlink, vehicle or VehicleSetup(), rig))
     bad: list[str] = []
     for check in checks:
         found: list[Finding] = []

@@ -4,7 +4,7 @@ Bodies are imported when they run.
 """
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
@@ -54,6 +54,13 @@ RigOut = Annotated[
     Path,
     Option("--out", "-o", help="Rig file to write; an existing one is kept under a dated name."),
 ]
+
+
+def _sigma(what: str) -> Any:
+    """Return the option of an uncertainty."""
+    return Option(help=f"Uncertainty of {what} (one sigma).")
+
+
 Medium = Annotated[
     str | None,
     Option(
@@ -134,18 +141,10 @@ def dome(
         float | None,
         Option(help="Initial guess of a flat port's distance from the lens, instead of a dome."),
     ] = None,
-    radius_tolerance_mm: Annotated[
-        float, Option(help="Uncertainty of the radius (one sigma).")
-    ] = 0.1,
-    thickness_tolerance_mm: Annotated[
-        float, Option(help="Uncertainty of the thickness (one sigma).")
-    ] = 0.1,
-    acrylic_tolerance: Annotated[
-        float, Option(help="Uncertainty of the housing's index (one sigma).")
-    ] = 0.003,
-    distance_sigma_mm: Annotated[
-        float, Option(help="Uncertainty of the poses' distances (one sigma).")
-    ] = 0.2,
+    radius_tolerance_mm: Annotated[float, _sigma("the radius")] = 0.1,
+    thickness_tolerance_mm: Annotated[float, _sigma("the thickness")] = 0.1,
+    acrylic_tolerance: Annotated[float, _sigma("the housing's index")] = 0.003,
+    distance_sigma_mm: Annotated[float, _sigma("the poses' distances")] = 0.2,
     shared_tilt_sigma_deg: Annotated[
         float,
         Option(
@@ -258,12 +257,8 @@ def water(
     temperature_c: Celsius = None,
     salinity: Salinity = None,
     fps: Annotated[float | None, Option(help="Frame rate of pictures.")] = None,
-    place_sigma_mm: Annotated[
-        float, Option(help="Uncertainty of the target's position (one sigma).")
-    ] = 0.2,
-    turn_sigma_deg: Annotated[
-        float, Option(help="Uncertainty of the target's rotation (one sigma).")
-    ] = 0.1,
+    place_sigma_mm: Annotated[float, _sigma("the target's position")] = 0.2,
+    turn_sigma_deg: Annotated[float, _sigma("the target's rotation")] = 0.1,
 ) -> None:
     """Calibrate the water."""
     from aqualvs.calibrate import water as body

@@ -59,10 +59,7 @@ def tune(
         frame=1.0 / rate_hz,
         current=current,
     )
-    body.run_tune(
-        body.TuneRequest(model=model, output=output, overwrite=overwrite, options=options),
-        typer.echo,
-    )
+    body.run_tune(model, typer.echo, options, output=output, overwrite=overwrite)
 
 
 def follow(

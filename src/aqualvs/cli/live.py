@@ -171,9 +171,7 @@ def doctor(
     """Check the machine."""
     if mavlink is None:
         refuse_given(context, _OF_MAVLINK, "for a MAVLink connection; add --mavlink")
-    from aqualvs.check.doctor import DoctorRequest, run_doctor
+    from aqualvs.check.doctor import run_doctor
     from aqualvs.live.options import vehicle_setup
 
-    setup = vehicle_setup(vehicle_file, mavlink_peer, mavlink_key)
-    request = DoctorRequest(source=source, rig=rig, mavlink=mavlink, vehicle=setup)
-    run_doctor(request)
+    run_doctor(source, rig, mavlink, vehicle_setup(vehicle_file, mavlink_peer, mavlink_key))

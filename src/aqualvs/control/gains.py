@@ -75,10 +75,9 @@ class ThrustMap:
         full = self.forward if forward > 0.0 else self.backward
         ahead = clipped(forward / full)
         aside = 0.0 if self.right == 0.0 else clipped(right / self.right)
-        if self.layout is Layout.STRAIGHT:
-            return ahead, aside
-        aside = clipped(aside, 1.0 - abs(ahead))
-        return ahead + aside, ahead - aside
+        if self.layout is Layout.VECTORED:
+            aside = clipped(aside, 1.0 - abs(ahead))
+        return self.split(ahead, aside)
 
     def split(self, forward: float, right: float) -> tuple[float, float]:
         """Return the efforts of both pairs of thrusters for those forward and right."""

@@ -14,7 +14,6 @@ from aqualvs.control.controller import RangeYawController
 from aqualvs.control.gains import ControlGains
 from aqualvs.control.missions import FollowMission, HoldMission, Mission
 from aqualvs.control.safety import SafetyGate, SafetyLimits
-from aqualvs.control.tune import tune
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.log import HoldMeasures, LoopLog, StepMeasures, hold_measures, step_measures
@@ -70,11 +69,6 @@ def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
     if model is None:
         raise OptionError(f"--vehicle {name}: not known; choose one of {', '.join(VEHICLE_NAMES)}")
     return replace(model, sticks=replace(model.sticks, gain=pilot_gain))
-
-
-def tuned_gains(model: VehicleModel) -> ControlGains:
-    """Return the gains that `aqualvs tune` gives for a vehicle."""
-    return tune(model).gains
 
 
 def sea(

@@ -19,10 +19,10 @@ from aqualvs.control.follow_log import FollowLog
 from aqualvs.control.missions import HoldMission, Mission, Stage
 from aqualvs.control.plan import load_plan
 from aqualvs.control.safety import LimitReason, SafetyLimits
-from aqualvs.control.tune import usable_gains
+from aqualvs.control.tune import tune, usable_gains
 from aqualvs.control.vehicle import Setpoint, SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
-from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
+from aqualvs.follow.case import SimCase, sea, vehicle_model
 from aqualvs.follow.log import write_log
 from aqualvs.follow.loop import RangeSensor, SimulatedLoop, Timing
 from aqualvs.follow.report import FIGURE_FILES, PAGE, summary_lines, write_report
@@ -308,7 +308,7 @@ def _case(
     model = vehicle_model(request.vehicle, request.pilot_gain)
     return SimCase(
         model=model,
-        gains=tuned_gains(model) if request.gains is None else usable_gains(request.gains),
+        gains=tune(model).gains if request.gains is None else usable_gains(request.gains),
         water=sea(
             current=request.current,
             current_to=request.current_to,

@@ -4,7 +4,7 @@ The step is simulated with the nonlinear vehicle, to verify the linear model tha
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -98,35 +98,31 @@ def _answer(time: FloatArray, ranges: FloatArray, options: StepOptions) -> StepA
     return StepAnswer(time, ranges, max(0.0, float(beyond.max())), settling)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TuneRequest:
-    """Request of `aqualvs tune`, see its `--help`."""
-
-    model: str  # Name of a vehicle model.
-    output: Path | None = None  # Gains file; None prints the gains.
-    overwrite: bool = False  # Whether to replace a file that this command wrote before.
-    options: TuneOptions = field(default_factory=TuneOptions)  # Requirements on the loops.
-
-
-def run_tune(request: TuneRequest, echo: Echo) -> None:
-    """Tune, simulate a step, and write or print the gains.
+def run_tune(
+    name: str,
+    echo: Echo,
+    options: TuneOptions | None = None,
+    *,
+    output: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Tune for a vehicle model, simulate a step, and write the gains, or print them if no file.
 
     Raises `OptionError` if the model is unknown, or no gains meet the requirements. Raises
     `OutputError` if the file cannot be written.
     """
-    model = VEHICLES.get(request.model.replace("-", "_"))
+    model, options = VEHICLES.get(name.replace("-", "_")), options or TuneOptions()
     if model is None:
-        raise OptionError(f"tune {request.model}: no such model; use one of {', '.join(VEHICLES)}")
-    files = [] if request.output is None else [request.output]
-    with Claim("tune", files, overwrite=request.overwrite):
-        tuned = tune(model, request.options)
-        for line in report(model, tuned, request.options):
+        raise OptionError(f"tune {name}: no such model; use one of {', '.join(VEHICLES)}")
+    with Claim("tune", [] if output is None else [output], overwrite=overwrite):
+        tuned = tune(model, options)
+        for line in report(model, tuned, options):
             echo(line)
-        if request.output is None:
+        if output is None:
             echo(gains_text(tuned.gains))
         else:
-            save_gains(tuned.gains, request.output)
-            echo(f"written to {request.output}")
+            save_gains(tuned.gains, output)
+            echo(f"written to {output}")
 
 
 def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:
