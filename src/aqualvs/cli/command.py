@@ -1,10 +1,4 @@
-"""Base of all commands: a command class that checks values, shared options, and fast imports.
-
-`CheckedCommand` checks the values of every option and argument before the command runs. `given`
-returns the parameters that the user set, and `refuse_given` refuses those that have no effect.
-`usage_text` describes errors of the parser in one line. `importing` switches garbage collection off
-during large imports.
-"""
+"""Base of all commands: a command class that checks values, shared options, and fast imports."""
 
 import contextlib
 import gc

@@ -9,10 +9,6 @@ the centre it turns about, closes in by
 `RangeYawController` holds the range along the body's forward axis alone; motion to the side, and
 the dome's swing in a turn, are compensated in advance. It rejects disturbances by the sea and by a
 target that is not square.
-
-- `Pid`: a PID controller for loops that are closed over frames; the measurement brings its time.
-- `SwellFilter`: a model of swell inside the loop, which counteracts periodic disturbances.
-- `Ramp`: setpoints that change at a bounded speed; `QuietZone`: suppression of small turning rates.
 """
 
 import math
@@ -42,7 +38,9 @@ class PidOptions:
 
 
 class Pid:
-    """Proportional, integral, derivative; the derivative acts on the measurement alone.
+    """Controller of a loop that is closed over frames: proportional, integral, derivative.
+
+    The derivative acts on the measurement alone; the measurement brings its time.
 
     Output = P (setpoint - measurement) + integral - D rate + feed-forward, within the limits. The
     integral stands still while it would push the output further beyond a limit, that of its rate

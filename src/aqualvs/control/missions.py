@@ -1,9 +1,4 @@
-"""Missions: what the controllers are to hold, updated step by step; hold, follow and survey.
-
-- `HoldMission`: hold a range and yaw.
-- `FollowMission`: follow a net at a constant distance, square to it, at a constant speed along it.
-- `SurveyMission`: survey a net in legs, one at each depth, back and forth.
-"""
+"""Missions: what the controllers are to hold, updated step by step; hold, follow and survey."""
 
 import math
 from abc import ABC, abstractmethod
@@ -200,11 +195,6 @@ class LegOptions:
                 f"leg: time {self.time:g} s, distance {self.distance:g} m; must be positive"
             )
 
-    @property
-    def ends(self) -> bool:
-        """Whether there is an end at all."""
-        return math.isfinite(min(self.time, self.distance)) or self.sector is not None
-
 
 def bearing_of(posture: Posture | None, state: VehicleState) -> float | None:
     """Return the compass direction of the target's far normal, in [0, 2 pi); None if unknown."""
@@ -237,7 +227,7 @@ class Leg:
 
 
 class FollowMission(Mission):
-    """Go along the net in one direction.
+    """Go along the net in one direction, at a constant distance and speed.
 
     `sway`: speed through the water, to the right positive, in m/s. `leg`: where it ends; never if
     left out. Raises `OptionError` if the speed is 0.
@@ -311,7 +301,7 @@ class SurveyOptions:
             raise OptionError(f"survey: depths {list(self.depths)} m; give one or more, 0 or more")
         if not (self.sway != 0.0 and math.isfinite(self.sway)):
             raise OptionError(f"survey: speed {self.sway:g} m/s; choose one, or hold instead")
-        if not self.leg.ends:
+        if self.leg == LegOptions():
             raise OptionError("survey: legs have no end; give a time, a distance or bearings")
         check_positive("survey", self, "descent", "patience")
 
