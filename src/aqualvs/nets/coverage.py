@@ -405,16 +405,10 @@ def _spread_of_mean(rows: FloatArray) -> float:
     return float(np.sqrt(variance) / weight) if weight > 0.0 else 1.0
 
 
-def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:
-    """Return the crossings of the lasers' lines with each family per metre, shape (L, F)."""
-    known = np.isfinite(view.direction)
-    direction = np.where(known, view.direction, lattice.normals[0])
-    return np.asarray(np.abs(direction @ lattice.waves.T))
-
-
 def long_gaps(lattice: NetLattice, view: NetView) -> BoolArray:
     """Mark the gaps of a frame that are longer than the lattice allows."""
-    longest = 1.0 / crossing_rates(lattice, view).max(axis=1)
+    direction = np.where(np.isfinite(view.direction), view.direction, lattice.normals[0])
+    longest = 1.0 / np.abs(direction @ lattice.waves.T).max(axis=1)
     # A dark piece this much longer than the lattice allows is no opening; openings of hexagons are
     # two bars long.
     too_long, hexagon_gap = 1.25, 2.0

@@ -53,16 +53,9 @@ def _cut_lines(
 ) -> tuple[int, int, int]:
     """Cut the lines into dashes, gaps and spans; return their numbers.
 
-    Parameters
-    ----------
-    dash : array, shape (N, 6)
-        Rows laser, whole, middle, length, height, width as in `Dashes`; written.
-    gap : array, shape (K, 6)
-        Rows laser, ends, closed, beyond as in `Gaps`; written.
-    span : array, shape (M, 3)
-        Rows laser, ends as in `NetView`; written.
-    usual : array, shape (L, 2)
-        `step` and `beyond` as in `NetView`; written.
+    Written are rows of `dash`, shape (N, 6): laser, whole, middle, length, height, width; of `gap`,
+    shape (K, 6): laser, ends, closed, beyond; of `span`, shape (M, 3): laser, ends; and of `usual`,
+    shape (L, 2): step, beyond; all as in `NetView`.
     """
     state, n, k, m = lines.state, 0, 0, 0
     n_lasers, n_lines = state.shape
@@ -264,14 +257,9 @@ class NetView(NetFrame):
 
 
 def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
-    """Cut the lasers' lines into dashes and gaps.
+    """Cut the lasers' lines in one frame into dashes and gaps.
 
-    Parameters
-    ----------
-    signal : NetSignal
-        Of one frame.
-    usable : bool array, shape (L, J), optional
-        Search lines to use; the others count as hidden.
+    `usable`, shape (L, J): search lines to use; the others count as hidden.
     """
     state = signal.state
     if usable is not None:

@@ -139,12 +139,7 @@ def looks_say(
 ) -> FloatArray:
     """Return the log-likelihood of a hole over sound net for every crossing (N,).
 
-    Parameters
-    ----------
-    laser, family, missed, run
-        As in `Strands`.
-    here : array, shape (N,)
-        Number of the piece of the laser's line.
+    `here`, shape (N,): number of the piece of the laser's line; the others are as in `Strands`.
     """
     share = np.maximum(_missed_share(laser, family, missed, run), _missed_here(laser, here, missed))
     dark = np.where(share < _EVIDENCE.too_many, -np.log(_EVIDENCE.dark + share), 0.0)
@@ -345,14 +340,7 @@ class Strands:
 def predicted_strands(lattice: NetLattice, view: NetView, place: FloatArray) -> Strands:
     """Return the predicted crossings of a frame's lines with strands, each seen or missed.
 
-    Parameters
-    ----------
-    lattice : NetLattice
-        Of the net.
-    view : NetView
-        Dashes and gaps of the frame.
-    place : array, shape (2,)
-        Place of the lattice in `net` (`Shift.place`), in metres.
+    `place`, shape (2,): of the lattice in `net` (`LatticeShift.place`), in metres.
     """
     gaps = view.gaps
     # Least share of light behind the net seen through a hole, relative to elsewhere.

@@ -89,12 +89,8 @@ class HoleMap:
 
         Parameters
         ----------
-        lattice : NetLattice
-            Of the stretch.
-        view : NetView
-            Dashes and gaps of the frame.
         knot : array, shape (2,)
-            Place of the lattice in `net` (`Shift.place`), in metres.
+            Place of the lattice in `net` (`LatticeShift.place`), in metres.
         place : array, shape (2,)
             Place of the origin of `net` on the map, in metres.
         piece : int

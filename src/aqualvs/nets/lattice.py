@@ -89,12 +89,8 @@ def find_lattice(
 ) -> NetLattice | None:
     """Find the lattice of the net in some frames, or None where none is visible.
 
-    Parameters
-    ----------
-    frames : sequence of Crossings
-        The net may have moved between them in its plane, but not turned.
-    before : NetLattice, optional
-        Lattice of neighbouring frames; tried first.
+    Between the frames the net may have moved in its plane, but not turned. `before`: lattice of
+    neighbouring frames; tried first.
     """
     # Least crossings of a usable frame.
     min_crossings = 5
@@ -335,14 +331,8 @@ def _sums(crossings: Crossings, waves: FloatArray) -> NDArray[np.complex128]:
     seen = np.bincount(crossings.laser, minlength=len(crossings.length))
     per_metre = seen / np.maximum(crossings.length, 1e-9)
     length = np.hypot(*(crossings.end - crossings.begin).T)
-    real, imaginary = wave_sums(
-        crossings.place,
-        crossings.begin,
-        crossings.end,
-        length * per_metre[crossings.span_laser],
-        waves,
-    )
-    return np.asarray(real + 1j * imaginary)
+    expected = length * per_metre[crossings.span_laser]
+    return wave_sums(crossings.place, crossings.begin, crossings.end, expected, waves)
 
 
 def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -381,19 +371,11 @@ def _initial_covariance() -> FloatArray:
 
 @dataclass(slots=True)
 class NetTrack:
-    """Tracker of the vehicle's motion along the net.
+    """Tracker of the vehicle's motion along the net."""
 
-    Attributes
-    ----------
-    place : array, shape (2,)
-        Current place of the vehicle's foot on the net: right and up of the first one, in metres.
-    velocity : array, shape (2,)
-        Metres a second.
-    piece : int
-        Incremented whenever the track is lost: places of different pieces are not related.
-    """
-
+    # Incremented whenever the track is lost: places of different pieces are not related.
     piece: int = 0
+
     _state: FloatArray = field(default_factory=lambda: np.zeros(4))
     _covariance: FloatArray = field(default_factory=_initial_covariance)
     _time_s: float = 0.0
@@ -402,12 +384,12 @@ class NetTrack:
 
     @property
     def place(self) -> FloatArray:
-        """As above."""
+        """Place (2,) of the vehicle's foot on the net: right and up of the first one, in metres."""
         return self._state[:2].copy()
 
     @property
     def velocity(self) -> FloatArray:
-        """As above."""
+        """Velocity (2,) of that place, in metres a second."""
         return self._state[2:].copy()
 
     def begins(self, time_s: float) -> bool:

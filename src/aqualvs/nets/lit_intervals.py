@@ -241,9 +241,13 @@ class NetReader:
         # Reach of a crossing, where two lasers' stripes disturb each other: in widths, plus pixels.
         crossing_widths, crossing_px = 1.5, 4.0
         margin = crossing_widths * np.maximum(wide[:, None], wide) + crossing_px * px
-        near = np.zeros(lines.along.shape, np.bool_)
-        _mark_crossings(lines.origin, lines.direction, lines.along, margin, near)
-        return near
+        across = lines.direction[:, ::-1] * [-1.0, 1.0]
+        start = np.sum((lines.origin[:, None] - lines.origin) * across, axis=-1)
+        rate = np.sum(lines.direction[:, None] * across, axis=-1)
+        # False where one of the two lines does not meet the net.
+        near = np.abs(start[..., None] + rate[..., None] * lines.along[:, None]) < margin[..., None]
+        near[np.diag_indices(len(near))] = False
+        return np.asarray(near.any(axis=1))
 
 
 def _line_on(sheet: Plane, net: SE3) -> tuple[FloatArray, FloatArray]:
@@ -305,25 +309,3 @@ def _resample(
             along[j] = s[a] + share * (s[b] - s[a])
             where[j] = position[a] + share * (position[b] - position[a])
             step[j] = abs((s[b] - s[a]) / (line[b] - line[a]))
-
-
-@kernel
-def _mark_crossings(
-    origin: FloatArray,
-    direction: FloatArray,
-    along: FloatArray,
-    margin: FloatArray,
-    near: BoolArray,
-) -> None:
-    """Mark the places on each laser's line that are nearer to another's than the margin (L, L)."""
-    for i in range(along.shape[0]):
-        for k in range(along.shape[0]):
-            if k == i:
-                continue
-            x, y = -direction[k, 1], direction[k, 0]
-            start = (origin[i, 0] - origin[k, 0]) * x + (origin[i, 1] - origin[k, 1]) * y
-            rate = direction[i, 0] * x + direction[i, 1] * y
-            for j in range(along.shape[1]):
-                # False where one of them does not meet the net.
-                if abs(start + rate * along[i, j]) < margin[i, k]:
-                    near[i, j] = True

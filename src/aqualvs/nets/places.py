@@ -45,10 +45,6 @@ class DivePostures:
     pitch: FloatArray
     yaw: FloatArray
 
-    def track(self) -> PostureTrack:
-        """Return the postures in the form for the search for a log's time offset."""
-        return PostureTrack(self.time_s, self.yaw, self.pitch, np.isfinite(self.range))
-
     def normals(self) -> FloatArray:
         """Return the net's far unit normals in `dome`, shape (N, 3)."""
         return normals_of(self.pitch, self.yaw)
@@ -212,7 +208,8 @@ def _estimate_offset(
 ) -> TimeOffset | OffsetRefusal:
     clocks = offset_from_clocks(log, None if video is None else dive_start_utc(video))
     start = clocks if isinstance(clocks, TimeOffset) else None
-    motion = find_time_offset(log, postures.track(), start=start)
+    track = PostureTrack(postures.time_s, postures.yaw, postures.pitch, np.isfinite(postures.range))
+    motion = find_time_offset(log, track, start=start)
     return motion if isinstance(motion, TimeOffset) or start is None else start
 
 

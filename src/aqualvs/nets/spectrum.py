@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.compiled import python_of
 from aqualvs.nets.spectrum_kernels import (
     HIGHEST,
     MAX_HARMONICS,
@@ -30,10 +31,10 @@ from aqualvs.nets.spectrum_kernels import (
     SHARE_OF_REST,
     SHELL_1,
     AllCrossings,
-    comb_power,
     expected_on,
     families_gain,
-    free_gains,
+    free_gain_of,
+    gain_of,
     miscount,
     off_crests,
     shell_gain,
@@ -54,6 +55,9 @@ _APART = 7.5e-3
 _MAX_ON_GRID = 12
 
 T = TypeVar("T")
+
+# For arrays of powers.
+_gains, _free_gains = python_of(gain_of), python_of(free_gain_of)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,10 +156,6 @@ class Spectrum:
         share /= pieces[number]
         place = begin[number] + share[:, None] * (end - begin)[number]
         return place, (self.crossings.expected[first:last] / pieces)[number]
-
-    def at(self, wave: FloatArray, n_harmonics: int = 1) -> FloatArray:
-        """Return the power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
-        return comb_power(self.crossings, wave[0], wave[1], n_harmonics)
 
     def polar(self, most: int = _MAX_ON_GRID) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the local maximum power at sizes (K,) and directions (A,) of waves, shape (K, A).
@@ -256,12 +256,6 @@ def score(spectrum: Spectrum, hypothesis: Hypothesis) -> float:
     return gain - off - _uneven(hypothesis)
 
 
-def _gain(power: FloatArray, mean: float) -> FloatArray:
-    """Return `gain_of` for many powers."""
-    gain: FloatArray = np.minimum(power, 2.0 * mean) * (1.0 - 1.0 / mean) - np.log(mean)
-    return gain
-
-
 def _uneven(hypothesis: Hypothesis) -> float:
     """Return the penalty of two families by their pitches and angle: sides are equally long."""
     if hypothesis.mesh is Mesh.SIX_SIDED:
@@ -288,7 +282,7 @@ def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: f
     for h in range(1, MAX_HARMONICS + 1):
         k = np.rint((h * size - size[0]) / (size[1] - size[0])).astype(int)
         inside = (k < len(size)) & ((h == 1) | (h * size < HIGHEST))
-        gain[inside] += _gain(power[k[inside]], 1.0 + per_frame * (share * REGULAR**h) ** 2)
+        gain[inside] += _gains(power[k[inside]], 1.0 + per_frame * (share * REGULAR**h) ** 2)
     return gain
 
 
@@ -339,7 +333,7 @@ def _six_sided(
     spectrum: Spectrum, size: FloatArray, angle: FloatArray, power: FloatArray
 ) -> list[Hypothesis]:
     bars = _family_gain(power, size, spectrum.per_frame, 1.0 / 3.0)
-    shell = _gain(power, 1.0 + spectrum.per_frame * SHELL_1**2)
+    shell = _gains(power, 1.0 + spectrum.per_frame * SHELL_1**2)
     # The first shell's waves are 1 / (1.5 bar) long.
     rows = np.flatnonzero(
         (size > 1.0 / LARGEST_PITCH) & (size < 1.0 / (1.5 * _SEARCH.shortest_bar))
@@ -352,7 +346,7 @@ def _six_sided(
     for turn in range(3):
         at = (np.arange(2 * sixth) + 2 * sixth * turn) % N_ANGLES
         total += shell[rows][:, at]
-        total[inside] += free_gains(power[double[inside]][:, at], spectrum.per_frame)
+        total[inside] += _free_gains(power[double[inside]][:, at], spectrum.per_frame)
         beside = (at + sixth) % N_ANGLES
         near = longer < len(size)
         total[near] += bars[longer[near]][:, beside]

@@ -8,9 +8,10 @@ waves that a lattice is made of. The gain is the log-likelihood of the crossings
 over that of random ones.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
@@ -219,8 +220,8 @@ def expected_on(
 @kernel
 def wave_sums(
     place: FloatArray, begin: FloatArray, end: FloatArray, expected: FloatArray, waves: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the sums of waves over places, less those expected over spans.
+) -> NDArray[np.complex128]:
+    """Return the sums (Q,) of waves over places, less those expected over spans.
 
     Parameters
     ----------
@@ -232,26 +233,21 @@ def wave_sums(
         Crossings expected on each.
     waves : array, shape (Q, 2)
         Wave vectors.
-
-    Returns
-    -------
-    real, imaginary : array, shape (Q,)
     """
-    real, imaginary = np.zeros(len(waves)), np.zeros(len(waves))
+    sums = np.zeros(len(waves), np.complex128)
     for k in range(len(waves)):
         qx, qy = waves[k]
         for i in range(len(place)):
             angle = _TURN * (qx * place[i, 0] + qy * place[i, 1])
-            real[k] += np.cos(angle)
-            imaginary[k] += np.sin(angle)
+            sums[k] += complex(np.cos(angle), np.sin(angle))
         for i in range(len(begin)):
             first = _TURN * (qx * begin[i, 0] + qy * begin[i, 1])
             last = _TURN * (qx * end[i, 0] + qy * end[i, 1])
             middle, half = 0.5 * (first + last), 0.5 * (last - first)
             share = np.sin(half) / half if abs(half) > 1e-6 else 1.0
-            real[k] -= expected[i] * share * np.cos(middle)
-            imaginary[k] -= expected[i] * share * np.sin(middle)
-    return real, imaginary
+            weight = expected[i] * share
+            sums[k] -= complex(weight * np.cos(middle), weight * np.sin(middle))
+    return sums
 
 
 HIGHEST = 125.0
@@ -269,24 +265,17 @@ _FREEDOM, _FEW_CROSSINGS = 0.7, 15.0
 
 
 @inline_kernel
-def gain_of(power: float, mean: float) -> float:
+def gain_of(power: Any, mean: float) -> Any:
     """Return the log-likelihood of a power over random crossings, at an expected peak.
 
     `mean` is the expected power. A peak much higher than the model's counts as one twice as high.
     """
-    return float(min(power, 2.0 * mean) * (1.0 - 1.0 / mean) - np.log(mean))
+    return np.minimum(power, 2.0 * mean) * (1.0 - 1.0 / mean) - np.log(mean)
 
 
 @inline_kernel
-def free_gain_of(power: float, per_frame: float) -> float:
+def free_gain_of(power: Any, per_frame: float) -> Any:
     """Return the gain where the mean is not known, less a penalty for the free parameter."""
-    mean = max(power, 1.0)
-    price = _FREEDOM * per_frame / (per_frame + _FEW_CROSSINGS)
-    return float(mean - 1.0 - np.log(mean) - price)
-
-
-def free_gains(power: FloatArray, per_frame: float) -> FloatArray:
-    """Return `free_gain_of` for many powers."""
     mean = np.maximum(power, 1.0)
     price = _FREEDOM * per_frame / (per_frame + _FEW_CROSSINGS)
     return mean - 1.0 - np.log(mean) - price
@@ -360,14 +349,8 @@ def miscount(
 ) -> float:
     """Return the penalty for the numbers of crossings that the lasers have seen.
 
-    Parameters
-    ----------
-    lines, laser, seen, lit, n_frames
-        As attributes of `Spectrum`.
-    families : array, shape (F, 2)
-        Waves of the strands.
-    density : float
-        Share of each family's lines that exists.
+    `families`, shape (F, 2): waves of the strands. `density`: share of each family's lines that
+    exists. The others are attributes of `Spectrum`.
     """
     expected = np.zeros(len(seen))
     for i in range(len(lines)):
