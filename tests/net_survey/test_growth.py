@@ -7,7 +7,7 @@ import pytest
 
 from aqualvs.net_survey.comparison import HoleState, compare
 from aqualvs.net_survey.frames import SurveyShift, WallFrame, place_survey
-from aqualvs.net_survey.growth import Growth, common_cells, history
+from aqualvs.net_survey.growth import Growth, history
 from aqualvs.net_survey.tables import summary_lines
 from net_change_cases import RADIUS, Cage, dive
 
@@ -152,7 +152,7 @@ def test_without_noise_growth_is_exact():
     assert [one.value for one in wall.means] == pytest.approx([0.3, 0.33, 0.39], rel=1e-6)
     assert [one.value for one in result.whole] == pytest.approx([0.3, 0.33, 0.39], rel=1e-6)
     assert result.rate.value == pytest.approx(0.003, rel=1e-6)
-    assert common_cells(wall.history).sum() >= 10
+    assert wall.history.known.all(axis=1).sum() >= 10
 
 
 def test_dives_that_see_other_parts_do_not_pass_for_growth():
@@ -180,7 +180,7 @@ def test_places_weigh_where_solidity_changes_from_place_to_place():
                 SurveyShift(np.zeros(2), np.full(2, open_sigma), np.ones(2, bool)),
             ]
             wall = history(placed, shifts, frame, 1.0)
-            variance[pattern, open_sigma] = wall.place_variance[common_cells(wall)].mean(axis=0)
+            variance[pattern, open_sigma] = wall.place_variance[wall.known.all(axis=1)].mean(axis=0)
     assert variance[0.0, 0.5] == pytest.approx([0.0, 0.0], abs=1e-12)
     # The pattern has a slope of 0.06 a metre; lanes that are 0.2 m apart differ by its share.
     assert np.all(variance[0.05, 0.0] > 1e-6)

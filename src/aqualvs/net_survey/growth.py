@@ -92,12 +92,11 @@ class WallHistory:
         """Days since the first date."""
         return np.array([(one - self.dates[0]).days for one in self.dates], np.float64)
 
-    def estimate(self, factors: FloatArray) -> Growth:
-        """Return the sum of solidities times factors (C, V), which are 0 where not known."""
+    def parts(self, factors: FloatArray) -> tuple[float, FloatArray, float]:
+        """Return a sum of solidities times factors (C, V), 0 where unknown, for `variance_of`."""
         value = float(np.nansum(np.where(factors != 0.0, factors * self.solidity, 0.0)))
         of_stretches = self.weights.T @ factors.ravel() * self.sigma
-        place = float(np.sum(factors**2 * self.place_variance))
-        return self.variance_of(value, of_stretches, place)
+        return value, of_stretches, float(np.sum(factors**2 * self.place_variance))
 
     def variance_of(self, value: float, of_stretches: FloatArray, place: float) -> Growth:
         """Return a sum with its standard deviation.
@@ -216,11 +215,8 @@ def cell_changes(wall: WallHistory) -> list[CellChange]:
     doi:10.1111/j.2517-6161.1995.tb02031.x.
     """
     cells = np.flatnonzero(wall.known.sum(axis=1) >= 2)
-    factors = _wall_factors(wall)
-    whole = wall.weights.T @ factors.ravel() * wall.sigma
-    growth = wall.estimate(factors)
-    place = float(np.sum(factors**2 * wall.place_variance))
-    found = [_cell(wall, int(c), (growth, whole, place)) for c in cells]
+    of_wall = wall.parts(_wall_factors(wall))
+    found = [_cell(wall, int(c), of_wall) for c in cells]
     changed = _discoveries(np.array([one.difference.z for one in found]))
     apart = _discoveries(np.array([one.excess.z for one in found]))
     return [
@@ -236,22 +232,17 @@ def wall_growth(wall: WallHistory) -> Growth | None:
     """
     if not np.any(wall.known.sum(axis=1) >= 2):
         return None
-    return wall.estimate(_wall_factors(wall))
-
-
-def common_cells(wall: WallHistory) -> BoolArray:
-    """Mark the cells (C,) that were seen on every date."""
-    return np.asarray(wall.known.all(axis=1))
+    return wall.variance_of(*wall.parts(_wall_factors(wall)))
 
 
 def date_means(wall: WallHistory) -> list[Growth | None]:
     """Return the mean solidity of the cells common to all dates, date by date."""
-    common = common_cells(wall)
+    common = np.asarray(wall.known.all(axis=1))
     if not common.any():
         return [None] * len(wall.dates)
     share = common[:, None] / np.count_nonzero(common)
     of_dates = np.eye(len(wall.dates))
-    return [wall.estimate(share * of_date) for of_date in of_dates]
+    return [wall.variance_of(*wall.parts(share * of_date)) for of_date in of_dates]
 
 
 def _wall_factors(wall: WallHistory) -> FloatArray:
@@ -263,7 +254,7 @@ def _wall_factors(wall: WallHistory) -> FloatArray:
     return np.asarray(off / max(float(np.sum(off**2)), 1e-12))
 
 
-def _cell(wall: WallHistory, cell: int, of_wall: tuple[Growth, FloatArray, float]) -> CellChange:
+def _cell(wall: WallHistory, cell: int, of_wall: tuple[float, FloatArray, float]) -> CellChange:
     dates = np.flatnonzero(wall.known[cell])
     first, last = int(dates[0]), int(dates[-1])
     single = [_sum(wall, cell, np.array([visit]), np.ones(1)) for visit in dates]
@@ -281,7 +272,7 @@ def _cell(wall: WallHistory, cell: int, of_wall: tuple[Growth, FloatArray, float
         after=single[-1],
         difference=_sum(wall, cell, dates[[0, -1]], np.array([-1.0, 1.0])),
         per_day=wall.variance_of(per_day, of_stretches, own_place),
-        excess=wall.variance_of(per_day - growth.value, of_stretches - whole, own_place + place),
+        excess=wall.variance_of(per_day - growth, of_stretches - whole, own_place + place),
         seen=(float(wall.seen[cell, first]), float(wall.seen[cell, last])),
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.net_survey.comparison import LOOKED, Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.frames import WallFrame
-from aqualvs.net_survey.growth import CellChange, Growth, common_cells
+from aqualvs.net_survey.growth import CellChange, Growth
 from aqualvs.nets.tables import Cell
 from aqualvs.text import count_text, with_sign
 
@@ -163,7 +163,7 @@ def _mean_lines(wall: OnWall) -> Iterator[str]:
     if not known:
         yield "  no part of the net was seen on all dates"
         return
-    n = int(np.count_nonzero(common_cells(wall.history)))
+    n = int(np.count_nonzero(wall.history.known.all(axis=1)))
     area = n * float(np.prod(wall.history.raster.size))
     means = ", ".join(f"{day}: {100 * m.value:.1f} ± {100 * m.sigma:.1f} %" for day, m in known)
     yield f"  solidity of the {area:.0f} m² seen on all dates: {means}"

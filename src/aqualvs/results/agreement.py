@@ -20,7 +20,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,13 +167,8 @@ class DriftFit:
 def fit_drift(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) -> DriftFit:
     """Fit a plane to every frame, and a step of one laser, or of none, to all of them.
 
-    Parameters
-    ----------
-    stripes : SeenStripes
-    sheets : sequence of Sheet
-        One for each laser, as the rig has them.
-    laser : int or None
-        The one that is assumed to have moved.
+    `sheets`: one for each laser, as the rig has them. `laser`: the one that is assumed to have
+    moved.
     """
     step = np.zeros(3)
     on_sheets = _SheetPoints.of(stripes, sheets)
@@ -208,17 +203,8 @@ def fit_zoom(
     """Fit the size of the picture to all frames, and a plane to each.
 
     A lens zooms about its principal point, software about the middle of the picture; the better one
-    counts.
-
-    Parameters
-    ----------
-    middles : sequence of array, shape (L, K, 2)
-        Bins of the frames from `bin_stripes`, in `image`.
-    rig : Rig
-    along_x : int array, shape (L,)
-        As in `bin_stripes`.
-    sheets : sequence of Sheet
-        One for each laser.
+    counts. `middles`, shape (L, K, 2) each: bins of the frames from `bin_stripes`, in `image`.
+    `along_x` is as there, and `sheets` are one for each laser.
     """
     from scipy import optimize  # Takes long to import, and few dives need it.
 
@@ -274,8 +260,7 @@ def _moved(sheet: Sheet, step: FloatArray) -> Sheet:
     return sheet.moved_by(np.concatenate([step, rest]))
 
 
-@dataclass(frozen=True, slots=True)
-class _SheetPoints:
+class _SheetPoints(NamedTuple):
     """Points of the bins on the assumed sheets, in `dome`; the bins of all lasers on one axis."""
 
     points: FloatArray  # Shape (F, L K, 3): metres; 0 where unseen.
@@ -288,22 +273,14 @@ class _SheetPoints:
     @classmethod
     def of(cls, stripes: SeenStripes, sheets: Sequence[Sheet]) -> "_SheetPoints":
         """Return the points on all sheets."""
-        parts = [_on_sheet(stripes, i, sheet) for i, sheet in enumerate(sheets)]
-        return cls(
-            np.concatenate([part.points for part in parts], axis=1),
-            np.concatenate([part.per_px for part in parts], axis=1),
-            np.concatenate([part.by_step for part in parts], axis=1),
-            np.concatenate([part.seen for part in parts], axis=1),
-        )
+        parts = (_on_sheet(stripes, i, sheet) for i, sheet in enumerate(sheets))
+        return cls._make(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
 
     def with_laser(self, stripes: SeenStripes, laser: int, sheet: Sheet) -> "_SheetPoints":
         """Return a copy with the points of one laser on another sheet."""
-        changed = _SheetPoints(
-            self.points.copy(), self.per_px.copy(), self.by_step.copy(), self.seen.copy()
-        )
-        mine, part = _bins_of(laser), _on_sheet(stripes, laser, sheet)
-        changed.points[:, mine], changed.per_px[:, mine] = part.points, part.per_px
-        changed.by_step[:, mine], changed.seen[:, mine] = part.by_step, part.seen
+        changed = _SheetPoints._make(array.copy() for array in self)
+        for array, own in zip(changed, _on_sheet(stripes, laser, sheet), strict=True):
+            array[:, _bins_of(laser)] = own
         return changed
 
 
@@ -496,11 +473,7 @@ class AgreementVerdict:
 class LaserAgreement:
     """Monitor of the agreement of a rig's lasers over a dive.
 
-    Parameters
-    ----------
-    rig : Rig
-        The rig of the scans. Its uncertainty counts: a disagreement within the uncertainty of the
-        calibration is no fault.
+    The rig's uncertainty counts: a disagreement within that of its calibration is no fault.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -510,9 +483,8 @@ class LaserAgreement:
         axes = [band.axis for band in plan_bands(rig, self._camera)]
         self._along_x = np.array([axis is SearchAxis.ALONG_X for axis in axes], np.int64)
         self._middles: dict[int, FloatArray] = {}
-        # One frame in this many is sampled at first: neighbouring frames are about the same.
-        every = 3
-        self._every = every
+        # One frame in this many is sampled; at first in 3: neighbouring frames are about the same.
+        self._every = 3
         self._verdict: AgreementVerdict | None = None
 
     @property

@@ -212,7 +212,7 @@ class PointsExport:
         self._paths = points_parquet, points_ply
         self._drafts = [path.with_name(path.name + DRAFT) for path in self._paths]
         self._waiting: list[Any] = []
-        self._n_waiting, self._n_points, self._n_vertices = 0, 0, 0
+        self._n_waiting, self._n_vertices = 0, 0
         self._written: Future[None] | None = None
         with contextlib.ExitStack() as stack:
             self._ply = stack.enter_context(self._drafts[1].open("wb"))
@@ -242,8 +242,8 @@ class PointsExport:
             self._waiting = table.slice(_ROWS_PER_GROUP).to_batches()
             self._n_waiting -= _ROWS_PER_GROUP
 
-    def finish(self) -> int:
-        """Complete both files; returns the number of points in `points.parquet`."""
+    def finish(self) -> None:
+        """Complete both files."""
         if self._n_waiting:
             self._begin_group(pa.Table.from_batches(self._waiting))
         self._await_group()
@@ -252,7 +252,6 @@ class PointsExport:
         self._open_files.close()
         for draft, path in zip(self._drafts, self._paths, strict=True):
             os.replace(draft, path)
-        return self._n_points
 
     def discard(self) -> None:
         """Remove the files that will not be finished."""
@@ -274,15 +273,14 @@ class PointsExport:
         self._table_file.write_table(group)
         vertices = _vertices(group)
         vertices.tofile(self._ply)
-        self._n_points += group.num_rows
         self._n_vertices += len(vertices)
 
 
-def export_points(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> int:
+def export_points(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> None:
     """Write record batches, as of `read_points_stream`, to the files of `PointsExport`.
 
-    Returns the number of points. Raises `OSError` as the system says it, a full disk for example;
-    nothing is left of the files then.
+    Raises `OSError` as the system says it, a full disk for example; nothing is left of the files
+    then.
     """
     first = next(batches, None)
     schema = POINTS_SCHEMA if first is None else first.schema
@@ -290,7 +288,7 @@ def export_points(batches: Iterator[Any], points_parquet: Path, points_ply: Path
     try:
         for batch in itertools.chain([] if first is None else [first], batches):
             export.add(batch)
-        return export.finish()
+        export.finish()
     except BaseException:
         export.discard()
         raise
