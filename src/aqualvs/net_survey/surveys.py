@@ -15,7 +15,7 @@ import numpy as np
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.report.run_data import mapping
+from aqualvs.report.run_data import source_name
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, POSTURE_CSV, check_run_files
 from aqualvs.results.run_request import read_run_yaml
@@ -83,10 +83,9 @@ def _parse_date(text: str) -> date | None:
 def _source(folder: Path) -> Path:
     """Return the video of a run, which may be gone; an empty path where it is not known."""
     try:
-        source = mapping(read_run_yaml(folder), "source")
+        return Path(source_name(read_run_yaml(folder)))
     except SourceError:
         return Path()
-    return Path(str(source.get("path") or source.get("name") or ""))
 
 
 Row: TypeAlias = Mapping[str, str]

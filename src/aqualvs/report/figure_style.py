@@ -1,6 +1,6 @@
 """Matplotlib figures written to files without a display, in the style of a journal.
 
-Figures are one or two columns wide and use the Agg canvas.
+Figures are one or two columns wide.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,13 +13,10 @@ if TYPE_CHECKING:
 
 
 def new_canvas(width_in: float, height_in: float) -> "Figure":
-    """Return an empty figure of a size in inches, on Matplotlib's Agg canvas."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Return an empty figure of a size in inches, which needs no display."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 BLUE, ORANGE, GREEN, PURPLE = "#0b5c7d", "#d55e00", "#1a8f5a", "#8a4fbf"

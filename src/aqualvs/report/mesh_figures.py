@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +21,7 @@ from matplotlib.patches import Annulus, Circle, Rectangle
 from pyarrow import parquet
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_from_mapping
@@ -267,15 +267,8 @@ def _box(low: FloatArray, high: FloatArray) -> Any:
 
 _COLUMNS = ["x_m", "y_m", "z_m", "label"]
 _PIXEL_COLUMNS = ["u_px", "v_px", "width_px", "label"]
-
-
-class _Counts(NamedTuple):
-    """Reflections of every frame and laser that has any, shape (K,) each."""
-
-    frame: IntArray
-    laser: IntArray
-    n_net: IntArray
-    n_all: IntArray
+# Frames have numbers of 32 bits, lasers of 8.
+_LASERS = 1 << 8
 
 
 def figures(
@@ -312,7 +305,7 @@ def figures(
         )
     try:
         names = [one.name for one in facts]
-        chosen = _candidates(points, _count(points), names, frame, laser)
+        chosen = _candidates(points, *_count(points), names, frame, laser)
         shown = (_read(points, one, facts[one[1]], run, options) for one in chosen)
         reflections = max(shown, key=_worth)
     except (pa.ArrowInvalid, OSError, KeyError) as fault:
@@ -344,19 +337,15 @@ def _paper_options(folder: Path, run: Mapping[str, Any], target: Path | None) ->
     return MeshFilterOptions() if target is None else target_dict(str(target)).mesh_filter
 
 
-def _count(points: Path) -> _Counts:
-    """Count net and other reflections, batch by batch, so that memory stays flat."""
-    # Frames have numbers of 32 bits, lasers of 8.
-    lasers = 1 << 8
+def _count(points: Path) -> tuple[Counter[int], Counter[int]]:
+    """Count net and all reflections by frame times `_LASERS` plus laser, with little memory."""
     n_net, n_all = Counter[int](), Counter[int]()
     for batch in stored_batches(points, 1 << 16, ("frame", "laser", "label")):
         frame = batch["frame"].to_numpy().astype(np.int64)
-        keys = frame * lasers + batch["laser"].to_numpy()
+        keys = frame * _LASERS + batch["laser"].to_numpy()
         n_net.update(keys[_is_net(batch["label"])].tolist())
         n_all.update(keys.tolist())
-    keys = np.array([*n_all], np.int64)
-    counts = (np.array([n[key] for key in n_all], np.int64) for n in (n_net, n_all))
-    return _Counts(keys // lasers, keys % lasers, *counts)
+    return n_net, n_all
 
 
 def _is_net(label: Any) -> BoolArray:
@@ -365,26 +354,26 @@ def _is_net(label: Any) -> BoolArray:
 
 
 def _candidates(
-    points: Path, counts: _Counts, names: list[str], frame: int | None, laser: str | None
+    points: Path,
+    n_net: Counter[int],
+    n_all: Counter[int],
+    names: list[str],
+    frame: int | None,
+    laser: str | None,
 ) -> list[tuple[int, int]]:
     """Return frames and lasers that show most of both, the best first, among those asked for."""
     if laser is not None and laser not in names:
         raise OptionError(f"--laser {laser}: no such laser; the rig has {', '.join(names)}")
-    asked = counts.laser < len(names)
-    if laser is not None:
-        asked &= counts.laser == names.index(laser)
-    if frame is not None:
-        asked &= counts.frame == frame
-    if not asked.any():
+    lasers = range(len(names)) if laser is None else [names.index(laser)]
+    asked = [key for key in n_all if key % _LASERS in lasers and frame in (None, key // _LASERS)]
+    if not asked:
         wanted = [f"--frame {frame}"] * (frame is not None) + [f"--laser {laser}"] * bool(laser)
         raise OptionError(f"{' '.join(wanted) or points}: no point there; choose another")
-    rows = np.flatnonzero(asked)
     # What shows only one of both shows nothing; of equals the fullest.
-    worth = np.minimum(counts.n_net, counts.n_all - counts.n_net)[rows]
-    best = rows[np.lexsort((counts.n_all[rows], worth))[::-1]]
+    asked.sort(key=lambda key: (min(n_net[key], n_all[key] - n_net[key]), n_all[key]))
     # So many of the fullest are looked at.
     candidates = 16
-    return [(int(counts.frame[row]), int(counts.laser[row])) for row in best[:candidates]]
+    return [divmod(key, _LASERS) for key in asked[::-1][:candidates]]
 
 
 def _worth(r: Reflections) -> float:

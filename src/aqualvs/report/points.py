@@ -218,8 +218,9 @@ class _Gathered:
                 np.stack([axis[mine] for axis in points.uv], axis=-1).astype(np.float64),
                 np.stack([axis[mine] for axis in points.xyz], axis=-1),
             )
-            old = samples.get(sample)
-            samples[sample] = new if old is None else FramePoints(*map(_joined, old, new))
+            if sample in samples:
+                new = FramePoints._make(map(np.concatenate, zip(samples[sample], new, strict=True)))
+            samples[sample] = new
 
     def _grow_cloud(self, points: _Points, target: IntArray, planes: FloatArray) -> None:
         drawn = self._rng.random(len(target))
@@ -236,10 +237,6 @@ class _Gathered:
             kept = np.argpartition(keys, cloud)[:cloud]
             keys, places, laser = keys[kept], places[kept], laser[kept]
         self._keys, summary.cloud_in_target, summary.cloud_laser = keys, places, laser
-
-
-def _joined(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-    return np.concatenate([first, second])
 
 
 def _count_cells(counts: IntArray, i: IntArray, j: IntArray) -> None:

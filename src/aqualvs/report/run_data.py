@@ -171,6 +171,12 @@ def mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def source_name(run: Mapping[str, Any]) -> str:
+    """Return the path of the source as the run has it; a folder of images has only a name."""
+    source = mapping(run, "source")
+    return str(source.get("path") or source.get("name") or "")
+
+
 def number(value: object) -> float:
     """Return a file's value as a finite float, NaN where it is none."""
     if isinstance(value, bool) or not isinstance(value, int | float):

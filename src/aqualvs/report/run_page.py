@@ -49,6 +49,7 @@ from aqualvs.report.run_data import (
     read_run_file,
     read_track,
     read_truth,
+    source_name,
     working_range_m,
 )
 from aqualvs.results.files import replace_text
@@ -133,7 +134,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     missing = (fault, no_points, no_pictures, no_bare, no_truth, no_net)
     warnings = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
-        title=Path(_source_name(run)).stem or run_dir.resolve().name,
+        title=Path(source_name(run)).stem or run_dir.resolve().name,
         run=run,
         track=track,
         truth=true if true is not None and np.isfinite(true).any() else None,
@@ -154,15 +155,9 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     )
 
 
-def _source_name(run: Mapping[str, Any]) -> str:
-    """Return the path of the source as the run has it; a folder of images has only a name."""
-    source = mapping(run, "source")
-    return str(source.get("path") or source.get("name") or "")
-
-
 def _source(run_dir: Path, run: Mapping[str, Any]) -> Path | str:
     """Return the source to decode again, or why there is none."""
-    path = _source_name(run)
+    path = source_name(run)
     if not path:
         return "run.yaml names no source: sample frames come without pictures."
     # A name that the file system refuses is no file of it.
