@@ -16,7 +16,7 @@ from aqualvs.scanning.candidates import Candidates, LinkedCandidates, find_candi
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector, FramePeaks
 from aqualvs.scanning.labels import label_candidates
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands, search_range
-from aqualvs.scanning.patch import Patch, fitted_patch
+from aqualvs.scanning.patch import fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod, Measurement, PostureEstimator
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
@@ -346,7 +346,7 @@ def _may_lack_colour(peaks: FramePeaks, scan: Scan) -> bool:
 
 
 def _fitted_surface(
-    posture: Posture, patch: Patch | None, points: FloatArray, weights: FloatArray
+    posture: Posture, patch: FloatArray | None, points: FloatArray, weights: FloatArray
 ) -> tuple[FittedSurface, FloatArray]:
     """Return the surface of a posture as fitted to points, and their weights for its residuals."""
     m = posture.normal_in_dome / posture.range

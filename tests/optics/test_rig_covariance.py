@@ -21,7 +21,7 @@ from aqualvs.optics.solved import (
 )
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis
-from aqualvs.scanning.patch import Patch, fitted_patch, nearest_tangent
+from aqualvs.scanning.patch import COEFFICIENTS, fitted_patch, nearest_tangent, packed_plane
 from aqualvs.scanning.posture import Posture, Refusal, range_pitch_yaw
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
@@ -177,13 +177,8 @@ def test_windows_and_the_water_in_front_of_them_count() -> None:
 def test_a_curved_net_answers_with_its_own_coefficients() -> None:
     """All points pushed outward by a number that stands for a shift of the camera."""
     rig = replace(example_rig(), housing=None)
-    base = Plane(np.array([0.0, 1.0, 0.0]), 0.6)
-    patch = Patch(
-        base,
-        np.array([1.0, 0.0, 0.0]),
-        np.array([0.0, 0.0, 1.0]),
-        np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.3]),
-    )
+    patch = packed_plane(Plane(np.array([0.0, 1.0, 0.0]), 0.6))
+    patch[COEFFICIENTS:] = 0.0, 0.0, 0.0, 0.5, 0.0, 0.3
     m = nearest_tangent(patch)
     assert m is not None
     points, pixels, laser = [], [], []

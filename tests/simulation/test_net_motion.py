@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.scanning.patch import Patch, nearest_tangent, packed_plane
+from aqualvs.scanning.patch import COEFFICIENTS, RIGHT, UP, nearest_tangent, packed_plane
 from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer
@@ -89,11 +89,11 @@ def lit_posture(wall: NetWall, pose: SE3, twine: float) -> np.ndarray:
     """Posture from the lit points of a fine net: a paraboloid by least squares."""
     points, scene = lit_points(wall, pose, twine)
     plane = scene.target_plane()
-    flat = Patch.unpacked(plane, packed_plane(plane))
-    u, v = points @ flat.right, points @ flat.up
+    patch = packed_plane(plane)
+    u, v = points @ patch[RIGHT:UP], points @ patch[UP:COEFFICIENTS]
     terms = np.stack([np.ones_like(u), u, v, 0.5 * u * u, u * v, 0.5 * v * v], axis=-1)
-    fit = np.linalg.lstsq(terms, flat.base.signed_distance(points), rcond=None)[0]
-    m = nearest_tangent(Patch(flat.base, flat.right, flat.up, fit))
+    patch[COEFFICIENTS:] = np.linalg.lstsq(terms, plane.signed_distance(points), rcond=None)[0]
+    m = nearest_tangent(patch)
     assert m is not None
     return np.array(range_pitch_yaw(m))
 

@@ -61,7 +61,7 @@ def label_other(
     is_mesh : bool
         As in `Surface`.
     target : array, shape (16,)
-        The target as `Patch.packed` gives it; empty where there is none.
+        The target as a patch; empty where there is none.
     explained : bool array, shape (N,), label : uint8 array, shape (N,)
         Completed in place.
     """
@@ -121,7 +121,7 @@ def label_target(
     is_mesh : bool
         As in `Surface`.
     target : array, shape (16,)
-        As `Patch.packed` gives it.
+        The surface as a patch.
     inliers, net_mask : bool array, shape (N,)
         As in `Measurement`; the second empty where there is none.
     explained : bool array, shape (N,)
@@ -184,7 +184,7 @@ def label_loose(
     shapes : ComponentShapes
         Of their components.
     target : array, shape (16,)
-        As `Patch.packed` gives it; empty where there is none.
+        The target as a patch; empty where there is none.
     working_range : (float, float)
         Distances from the dome's centre beyond which clutter is out of range, in metres.
     explained : bool array, shape (N,)
@@ -359,11 +359,11 @@ def label_candidates(
 
 
 def _target_surface(target: Surface | None, found: Measurement) -> FloatArray:
-    """Return the best estimate of the target's surface (16,), as `Patch.packed`; empty if none."""
+    """Return the best estimate of the target's surface as a patch (16,); empty if none."""
     if target is None:
         return _NOTHING
     if found.patch is not None:
-        return found.patch.packed()
+        return found.patch
     posture = found.posture
     if isinstance(posture, Posture):
         return packed_plane(Plane(posture.normal_in_dome, posture.range))

@@ -192,7 +192,7 @@ def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: flo
     points : array, shape (N, 3), laser : int array, shape (N,)
         Of the strands.
     patch : array, shape (16,)
-        As `Patch.packed` gives it.
+        The surface as a patch.
     """
     best, second = 0.0, 0.0
     for k in range(n_bins(laser)):

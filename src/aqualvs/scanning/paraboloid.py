@@ -9,7 +9,7 @@ only; the fit starts there and grows outward, because the fitted band predicts t
 Each step is a weighted least-squares fit of the six coefficients.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,8 +33,6 @@ from aqualvs.scanning.patch import (
     SIGMA_CURVATURE,
     SIGMA_TWIST,
     UP,
-    Patch,
-    PatchFit,
     nearest_tangent,
     packed_plane,
 )
@@ -149,20 +147,6 @@ def _is_clear(
     return bool(n_inside >= more_observations * n_on_plane or less)
 
 
-@lazy_kernel
-def curvature_hint(seen: Observations, weights: FloatArray, patch: FloatArray) -> float:
-    """Return `curvature_in_sigmas` of M observations over a patch's base plane.
-
-    `weights` (M,) are those of the plane fit.
-    """
-    n = weights.shape[0]
-    terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
-    over_plane(seen.points, seen.sensitivity, patch, terms, height, per_px)
-    for i in range(n):
-        per_px[i] = abs(per_px[i]) * seen.sigma_px[i]
-    return curvature_in_sigmas(terms, height, per_px, weights)
-
-
 @inner_borrowing_kernel
 def over_plane(
     points: FloatArray,
@@ -231,17 +215,31 @@ def _solve(
     return True
 
 
-@inner_kernel
-def curvature_in_sigmas(
-    terms: FloatArray, height: FloatArray, sigma: FloatArray, weights: FloatArray
-) -> float:
-    """Return the most significant of p, q, r of M observations, in sigmas; 0 for too few."""
-    n = height.shape[0]
-    weight, factor, coefficients = np.empty(n), np.empty((N, N)), np.empty(N)
+@lazy_kernel
+def shows_curvature(seen: Observations, weights: FloatArray, patch: FloatArray) -> bool:
+    """Return whether the residuals of a plane fit may be curved: a cheap test before a patch fit.
+
+    Parameters
+    ----------
+    seen : Observations
+        Those that the plane was fitted to, M of them.
+    weights : array, shape (M,)
+        Their weights in that fit.
+    patch : array, shape (16,)
+        The fit, from `packed_plane`.
+    """
+    # Least significance of the curvature, in sigmas, for which a patch is fitted. A robust plane
+    # fit drops the strands that bend away from it: of 150 simulated nets that bulge, clearly bent
+    # ones have 1.0 and more.
+    hint = 1.0
+    n = weights.shape[0]
+    terms, height, weight = np.empty((n, N)), np.empty(n), np.empty(n)
+    factor, coefficients = np.empty((N, N)), np.empty(N)
+    over_plane(seen.points, seen.sensitivity, patch, terms, height, weight)
     for i in range(n):
-        weight[i] = weights[i] / (sigma[i] * sigma[i])
+        weight[i] = weights[i] / squared(abs(weight[i]) * seen.sigma_px[i])
     if not _solve(terms, height, weight, factor, coefficients) or n <= N:
-        return 0.0
+        return False
     square = 0.0
     for i in range(n):
         off = height[i]
@@ -253,7 +251,7 @@ def curvature_in_sigmas(
     strongest = 0.0
     for k in range(3, N):
         strongest = max(strongest, abs(coefficients[k]) / (np.sqrt(inverse[k, k]) * scale))
-    return strongest
+    return bool(strongest > hint)
 
 
 @inner_kernel
@@ -401,38 +399,21 @@ def add_shared(
 MIN_BEND = 0.003
 """Least bend of a curved net between its visible points, as a share of the range."""
 
-# Least significance of the curvature in a plane fit, in sigmas, for which a patch is fitted. A
-# robust plane fit drops the strands that bend away from it: of 150 simulated nets that bulge,
-# clearly bent ones have 1.0 and more.
-_HINT = 1.0
 
+@dataclass(frozen=True, slots=True)
+class PatchFit:
+    """A patch that was fitted over a base plane."""
 
-def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
-    """Return whether the residuals of a plane fit may be curved: a cheap test before a patch fit.
-
-    Parameters
-    ----------
-    seen : Observations
-        Those that the plane was fitted to, M of them.
-    weights : array, shape (M,)
-        Their weights in that fit.
-    plane : Plane
-        The fit.
-    """
-    flat = packed_plane(plane)
-    return bool(curvature_hint(seen, weights, flat) > _HINT)
-
-
-class PatchAttempt(NamedTuple):
-    """A patch over a base plane, and whether it is clearly better than the plane."""
-
-    fit: PatchFit
-    is_clear: bool
+    patch: FloatArray  # Shape (16,): by robust least squares.
+    covariance: FloatArray  # Shape (6, 6): of its coefficients.
+    weights: FloatArray  # Shape (M,): robust weight of each observation, 0 to 1.
+    rms: float  # Weighted root mean square distance from the patch, in metres.
+    is_clear: bool  # Whether it is clearly better than the plane.
 
 
 def fit_patch(
     seen: Observations, plane: Plane, shared: SharedError, min_bend: float = MIN_BEND
-) -> PatchAttempt | None:
+) -> PatchFit | None:
     """Fit a patch to M observations, and compare it with the plane.
 
     Parameters
@@ -448,7 +429,7 @@ def fit_patch(
 
     Returns
     -------
-    PatchAttempt or None
+    PatchFit or None
         None if the curvature is not determined.
     """
     first = _fit_over(seen, plane, shared, 1.0, min_bend)
@@ -477,10 +458,8 @@ def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> 
     m = nearest_tangent(fit.patch)
     if m is None:
         return None
-    inside = fit.weights > 0.0
     length = float(np.linalg.norm(m))
-    again = _fit_over(seen, Plane(m / length, 1.0 / length), shared, inside)
-    return fit if again is None else again.fit
+    return _fit_over(seen, Plane(m / length, 1.0 / length), shared, fit.weights > 0.0) or fit
 
 
 def _fit_over(
@@ -489,16 +468,12 @@ def _fit_over(
     shared: SharedError,
     start: BoolArray | float,
     min_bend: float = MIN_BEND,
-) -> PatchAttempt | None:
-    """Fit a patch over a plane, grown from a mask of observations or those in `start` gates."""
+) -> PatchFit | None:
+    """Fit a patch over a plane, grown from `start`: so many gates, or a mask to be overwritten."""
     n = seen.n
-    inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
+    gates, inside = (start, np.empty(n, np.bool_)) if isinstance(start, float) else (0.0, start)
     patch, covariance, weights = packed_plane(plane), np.empty((N, N)), np.empty(n)
-    gates = start if isinstance(start, float) else 0.0
     found, is_clear, rms = fit_over(
         seen, gates, shared, min_bend, inside, patch, covariance, weights
     )
-    if not found:
-        return None
-    bent = Patch.unpacked(plane, patch)
-    return PatchAttempt(PatchFit(bent, covariance, weights, rms), is_clear)
+    return PatchFit(patch, covariance, weights, rms, is_clear) if found else None

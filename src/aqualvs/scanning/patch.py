@@ -1,11 +1,11 @@
 """Patches: parts of paraboloids over a base plane, and their point nearest to the vehicle.
 
-For kernels a patch is packed into 16 numbers: normal and offset of its base plane, the two unit
-vectors along u and v, and the coefficients a, b, c, p, q, r of its height (see `paraboloid`).
+A patch is an array of 16 numbers: normal and offset of its base plane in `dome`, the two unit
+vectors in that plane along which u and v run, and the coefficients a (m), b, c, p, q, r (1/m) of
+its height along the normal (see `paraboloid`).
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 
 NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
-"""Indices of the parts of a packed patch, and its length."""
+"""Indices of the parts of a patch, and its length."""
 N_COEFFICIENTS = 6
 
 SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
@@ -90,17 +90,14 @@ def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: F
 
 
 @lazy_kernel
-def carry_to_tangent(
-    patch: FloatArray, covariance: FloatArray, m: FloatArray, out: FloatArray
-) -> None:
-    """Write the covariance (3, 3) of m by that of the coefficients (6, 6); infinite if undefined.
+def tangent_covariance(patch: FloatArray, covariance: FloatArray, m: FloatArray) -> FloatArray:
+    """Return the covariance (3, 3) of `nearest_tangent`, in 1/m²; infinite if undefined.
 
-    To first order, by `tangent_jacobian`.
+    To first order, from that of the coefficients (6, 6), by `tangent_jacobian`.
     """
-    jacobian = np.empty((3, 6))
+    jacobian, out = np.empty((3, 6)), np.full((3, 3), np.inf)
     if not tangent_jacobian(patch, np.sqrt(np.diag(covariance)), m, jacobian):
-        out[:] = np.inf
-        return
+        return out
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -108,6 +105,7 @@ def carry_to_tangent(
                 for n in range(6):
                     total += jacobian[i, k] * covariance[k, n] * jacobian[j, n]
             out[i, j] = total
+    return out
 
 
 @lazy_borrowing_kernel
@@ -135,44 +133,8 @@ _BESIDE_VIEW = 0.6
 _FACING = 0.57
 
 
-@dataclass(frozen=True, slots=True)
-class Patch:
-    """A curved part of a net over a base plane."""
-
-    base: Plane  # In `dome`; heights are measured along its normal.
-    # Shape (3,): unit vectors in the base plane along which u and v run, in `dome`.
-    right: FloatArray
-    up: FloatArray
-    # Shape (6,): a (m), b, c, p, q, r (1/m) of the height.
-    coefficients: FloatArray
-
-    @classmethod
-    def unpacked(cls, base: Plane, packed: FloatArray) -> "Patch":
-        """Make a patch over a base plane from its packed form (16,)."""
-        right, up = packed[RIGHT:UP], packed[UP:COEFFICIENTS]
-        return cls(base, right, up, packed[COEFFICIENTS:])
-
-    def packed(self) -> FloatArray:
-        """Return normal, offset, right, up and coefficients as one array (16,), for kernels."""
-        packed = np.empty(PACKED)
-        packed[:RIGHT] = self.base.packed()
-        packed[RIGHT:UP], packed[UP:COEFFICIENTS] = self.right, self.up
-        packed[COEFFICIENTS:] = self.coefficients
-        return packed
-
-
-@dataclass(frozen=True, slots=True)
-class PatchFit:
-    """A fitted patch with its covariance."""
-
-    patch: Patch  # Least squares, robust.
-    covariance: FloatArray  # Shape (6, 6): of its coefficients.
-    weights: FloatArray  # Shape (M,): robust weight of each observation, 0 to 1.
-    rms: float  # Weighted root mean square distance from the patch, in metres.
-
-
 def packed_plane(plane: Plane) -> FloatArray:
-    """Return a plane as a packed patch (16,): u to the right, v upward, no curvature."""
+    """Return a plane as a patch (16,): u to the right, v upward, no curvature."""
     a, b, c = plane.normal.tolist()
     level = math.sqrt(a * a + b * b)
     right, ahead = b / level, -a / level
@@ -202,8 +164,8 @@ def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
     return bool(facing and (beyond < _BESIDE_VIEW * (high - low)[[0, 2]]).all())
 
 
-def nearest_tangent(patch: Patch) -> FloatArray | None:
-    """Return m = n/d of the tangent plane at the point nearest to the dome's centre.
+def nearest_tangent(patch: FloatArray) -> FloatArray | None:
+    """Return m = n/d of the plane that touches a patch (16,) nearest to the dome's centre.
 
     The posture to a plane is that at the foot of the perpendicular; so is that to a curved net.
 
@@ -213,37 +175,29 @@ def nearest_tangent(patch: Patch) -> FloatArray | None:
         In 1/m. None if there is no such point: the net curls around the vehicle.
     """
     m = np.empty(3)
-    return m if write_tangent(patch.packed(), m) else None
+    return m if write_tangent(patch, m) else None
 
 
-def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) of `nearest_tangent` by that of the coefficients, in 1/m²."""
-    covariance = np.empty((3, 3))
-    carry_to_tangent(fit.patch.packed(), fit.covariance, m, covariance)
-    return covariance
-
-
-def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurface:
+def fitted_patch(patch: FloatArray, m: FloatArray, points: FloatArray) -> FittedSurface:
     """Return a patch as a surface fitted to points (N, 3), with the posture to its tangent plane.
 
     Parameters
     ----------
-    patch : Patch
+    patch : array, shape (16,)
     m : array, shape (3,)
         From `nearest_tangent`.
     points : array, shape (N, 3)
         In `dome`, metres.
     """
-    packed, terms = patch.packed(), np.empty((len(points), N_COEFFICIENTS))
-    by_terms = np.empty((3, N_COEFFICIENTS))
-    write_terms(points, packed, terms)
-    if not tangent_jacobian(packed, _SCALES, m, by_terms):
+    terms, by_terms = np.empty((len(points), N_COEFFICIENTS)), np.empty((3, N_COEFFICIENTS))
+    write_terms(points, patch, terms)
+    if not tangent_jacobian(patch, _SCALES, m, by_terms):
         by_terms[:] = np.nan
-    _, b, c, p, q, r = patch.coefficients.tolist()
-    right, up = patch.right, patch.up
+    _, b, c, p, q, r = patch[COEFFICIENTS:].tolist()
+    right, up = patch[RIGHT:UP], patch[UP:COEFFICIENTS]
     across = np.outer(right, up)
     bend = p * np.outer(right, right) + q * (across + across.T) + r * np.outer(up, up)
-    normal = patch.base.normal - b * right - c * up
+    normal = patch[:OFFSET] - b * right - c * up
     return FittedSurface(terms, CURVATURE_PRIOR, normal, -bend, posture_by_plane(m) @ by_terms)
 
 
@@ -262,7 +216,6 @@ def intensity_share_near(
     points : array, shape (M, 3)
         Of the observations, in `dome`.
     patch : array, shape (16,)
-        As `Patch.packed` gives it.
     """
     height = np.empty(points.shape[0])
     heights_over(points, patch, height)

@@ -29,10 +29,15 @@ from aqualvs.scanning.net_surfaces import (
     share_near,
 )
 from aqualvs.scanning.observations import Observations, Observed, StripeObserver
-from aqualvs.scanning.paraboloid import MIN_BEND, fit_patch, refit_at_nearest, shows_curvature
-from aqualvs.scanning.patch import (
-    Patch,
+from aqualvs.scanning.paraboloid import (
+    MIN_BEND,
     PatchFit,
+    fit_patch,
+    refit_at_nearest,
+    shows_curvature,
+)
+from aqualvs.scanning.patch import (
+    COEFFICIENTS,
     heights_over,
     intensity_share_near,
     nearest_in_view,
@@ -117,7 +122,8 @@ class Measurement:
 
     posture: Posture | Refusal
     inliers: BoolArray  # Shape (N,): candidates in the posture; none if it is refused.
-    patch: Patch | None = None  # The curved surface, if a plane does not describe the net.
+    # Shape (16,): the curved surface, see `patch`, if a plane does not describe the net.
+    patch: FloatArray | None = None
     # Shape (N,): candidates on the net, also where its folds leave the surface; None if the target
     # is no net.
     net_mask: BoolArray | None = None
@@ -234,7 +240,8 @@ class PostureEstimator:
         distances_off(candidates.points, plane.normal, plane.offset, off)
         few = seen.observations.n < _FEW_STRANDS and has_much_beside(off, MODERATELY_BESIDE)
         bends = target.n_planes > 1 or has_much_beside(off)
-        bends = bends or shows_curvature(seen.observations, fit.weights, plane)
+        patch = packed_plane(plane)
+        bends = bends or shows_curvature(seen.observations, fit.weights, patch)
         least = MIN_BEND if bends else few * _STRONG_BEND
         curved, is_clear = None, False
         if least > 0.0:
@@ -247,7 +254,7 @@ class PostureEstimator:
             elif is_clear or is_observable:
                 # The nearest point is out of view, or the bend may be due to chance.
                 best = _inflated_by(flat, curved)
-        patch = packed_plane(plane) if best.patch is None else best.patch.packed()
+        patch = patch if best.patch is None else best.patch
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
         seen = self._observe_near(candidates, net_mask, off, plane)
         share = _share_on(seen, patch, plane)
@@ -466,17 +473,18 @@ class PostureEstimator:
             return None, False
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
         first = fit_patch(seen.observations, plane, shared, min_bend)
-        if first is None or not (first.is_clear or _may_bend(first.fit)):
+        if first is None or not (first.is_clear or _may_bend(first)):
             return None, False
-        fit = refit_at_nearest(first.fit, seen.observations, shared)
+        fit = refit_at_nearest(first, seen.observations, shared)
         m = None if fit is None else nearest_tangent(fit.patch)
         if fit is None or m is None:
             return None, False
-        tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
+        covariance = tangent_covariance(fit.patch, fit.covariance, m)
+        tangent = PlaneFit(m, covariance, fit.weights, fit.rms)
         found = self._posture_of_fit(candidates, seen, tangent)
         if found is None or isinstance(found.posture, Refusal):
             return None, False
-        along = fit.patch.coefficients[[3, 5]].tolist()
+        along = fit.patch[COEFFICIENTS:][[3, 5]].tolist()
         sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
         bent = replace(found.posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
         return replace(found, posture=bent, patch=fit.patch), first.is_clear
@@ -577,7 +585,7 @@ def _plane_of(fit: PlaneFit) -> Plane:
 def _may_bend(fit: PatchFit) -> bool:
     """Return whether a net's curvature is more than chance would make of a flat net's strands."""
     min_sigmas = 3.0  # Least significance of a curvature.
-    curvature, variance = fit.patch.coefficients[3:], np.diag(fit.covariance)[3:]
+    curvature, variance = fit.patch[COEFFICIENTS + 3 :], np.diag(fit.covariance)[3:]
     return bool((curvature**2 > min_sigmas**2 * variance).any())
 
 

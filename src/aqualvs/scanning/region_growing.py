@@ -59,7 +59,7 @@ def recruit_candidates(
     of_candidate : int array, shape (N,)
         Row of each one's subsegment, below `n_subsegments`.
     patch : array, shape (16,)
-        The target as `Patch.packed` gives it.
+        The target as a patch.
     other : bool array, shape (N,)
         Candidates that another surface explains.
     taken : bool array, shape (N,)
