@@ -101,7 +101,7 @@ def test_edge_cases_agree(points: FloatArray) -> None:
 
 
 def test_cells_far_apart_agree() -> None:
-    """Clusters metres apart go through the hash's wide table and negative neighbours' blocks."""
+    """Clusters metres apart leave strips between them empty."""
     chosen = MeshFilterOptions(rd_theta=10e-3, dd=5e-3, r_min=15e-3, r_max=35e-3)
     one = stripe(6, period=28e-3, size=10e-3)
     points = np.concatenate([one + np.array([2.0, 1.5]) * i for i in range(2)])

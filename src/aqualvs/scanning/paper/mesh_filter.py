@@ -6,175 +6,70 @@ amount of light in the ring where its two neighbours must be. docs/mesh-filter.m
 chosen where the paper's text is ambiguous.
 
 `mesh_filter_dense` is Algorithm 1 line by line, `mesh_filter` its compiled form: it counts the lit
-cells near each lit cell with a spatial hash (`keep_points`).
+cells near each lit cell, in strips of the laser plane (`keep_cells`).
 """
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from aqualvs.errors import OptionError, check_positive
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, as_vectors
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 
 
-class Limits(NamedTuple):
-    """Limits by which a cell belongs to the mesh (paper, Algorithm 1)."""
-
-    # Largest squared distance, in cells, of the cells of the regions A, B and C.
-    a: int
-    b: int
-    c: int
-    # Lit cells in A.
-    min_in_a: int
-    max_in_a: int
-    # Lit cells in A and B together.
-    max_in_ab: int
-    # Lit cells in C.
-    min_in_c: int
-    max_in_c: int
-    # Side of the blocks of the hash, in cells; not below the radius of C.
-    reach: int
-
-
-class _Numbering(NamedTuple):
-    """Distinct pairs of integers, numbered in the order in which they first appear."""
-
-    table: IntArray  # Hash table of the numbers; -1 in empty slots.
-    number: IntArray  # Shape (N,): number of every pair.
-    first: IntArray  # Shape (n,): where every numbered pair first appears.
-
-
-class _Blocks(NamedTuple):
-    """Cells sorted by the block that they lie in."""
-
-    # Shape (n_cells,): the cells (m, n), block by block. Floats, because processors square
-    # them faster.
-    m: FloatArray
-    n: FloatArray
-    # Shape (n_blocks + 1,): where every block begins.
-    start: IntArray
-    # Shape (n_cells,): index of every cell in `m` and `n`.
-    place: IntArray
-
-
 @kernel
-def keep_points(columns: IntArray, rows: IntArray, limits: Limits, out: BoolArray) -> None:
-    """Run Algorithm 1 of the paper for points in cells (columns, rows), each of shape (N,)."""
-    cells = _number_pairs(columns, rows)
-    m, n = columns[cells.first], rows[cells.first]
-    block_m, block_n = m // limits.reach, n // limits.reach
-    known = _number_pairs(block_m, block_n)
-    blocks = _sort_by_block(m, n, known)
-    keep = np.empty(m.shape[0], dtype=np.bool_)
-    near = np.empty(9, dtype=np.int64)
-    for i_block in range(known.first.shape[0]):
-        home = known.first[i_block]
-        n_near = _neighbours(block_m, block_n, home, known, near)
-        for place in range(blocks.start[i_block], blocks.start[i_block + 1]):
-            keep[place] = _belongs(blocks, place, near, n_near, limits)
-    for k in range(columns.shape[0]):
-        out[k] = keep[blocks.place[cells.number[k]]]
+def keep_cells(
+    strip: IntArray,
+    m: IntArray,
+    n: IntArray,
+    reach: int,
+    squared_radii: tuple[int, int, int],
+    dg: int,
+    keep: BoolArray,
+) -> None:
+    """Run Algorithm 1 of the paper for distinct lit cells (m, n).
 
-
-@inline_kernel
-def _slot(x: int, y: int, mask: int) -> int:
-    """Hash two integers to a slot (constants of Teschner et al., VMV 2003)."""
-    mixed = x * 73856093 ^ y * 19349663
-    return (mixed ^ (mixed >> 15)) & mask
-
-
-@inline_kernel
-def _number_pairs(x: IntArray, y: IntArray) -> _Numbering:
-    size = 8
-    while size < 2 * x.shape[0]:
-        size *= 2
-    table = np.full(size, -1, dtype=np.int64)
-    number = np.empty(x.shape[0], dtype=np.int64)
-    first = np.empty(x.shape[0], dtype=np.int64)
-    n_known = 0
-    for k in range(x.shape[0]):
-        slot = _find(x, y, x[k], y[k], table, first)
-        if table[slot] < 0:
-            table[slot] = n_known
-            first[n_known] = k
-            n_known += 1
-        number[k] = table[slot]
-    return _Numbering(table, number, first[:n_known])
-
-
-@inline_kernel
-def _find(x: IntArray, y: IntArray, at_x: int, at_y: int, table: IntArray, first: IntArray) -> int:
-    """Return the slot of a pair, or the empty slot where it would go."""
-    mask = table.shape[0] - 1
-    slot = _slot(at_x, at_y, mask)
-    while table[slot] >= 0:
-        known = first[table[slot]]
-        if x[known] == at_x and y[known] == at_y:
-            break
-        slot = (slot + 1) & mask
-    return slot
-
-
-@inline_kernel
-def _sort_by_block(m: IntArray, n: IntArray, known: _Numbering) -> _Blocks:
-    n_cells, n_blocks = m.shape[0], known.first.shape[0]
-    start = np.zeros(n_blocks + 1, dtype=np.int64)
-    for i in range(n_cells):
-        start[known.number[i] + 1] += 1
-    for i in range(n_blocks):
-        start[i + 1] += start[i]
-    free = start.copy()
-    place = np.empty(n_cells, dtype=np.int64)
-    sorted_m, sorted_n = np.empty(n_cells), np.empty(n_cells)
-    for i in range(n_cells):
-        at = free[known.number[i]]
-        free[known.number[i]] += 1
-        place[i], sorted_m[at], sorted_n[at] = at, m[i], n[i]
-    return _Blocks(sorted_m, sorted_n, start, place)
-
-
-@inline_kernel
-def _neighbours(
-    block_m: IntArray, block_n: IntArray, home: int, known: _Numbering, near: IntArray
-) -> int:
-    """Write the numbers of a cell's block and of the blocks around it; return how many exist."""
-    count = 0
-    for bm in range(block_m[home] - 1, block_m[home] + 2):
-        for bn in range(block_n[home] - 1, block_n[home] + 2):
-            slot = _find(block_m, block_n, bm, bn, known.table, known.first)
-            if known.table[slot] >= 0:
-                near[count] = known.table[slot]
-                count += 1
-    return count
-
-
-@inline_kernel
-def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: Limits) -> bool:
-    """Compare the lit cells in the regions around a cell with the limits."""
-    m, n = blocks.m[place], blocks.n[place]
-    in_a, in_ab, in_abc = 0, 0, 0
-    for i in range(n_near):
-        for k in range(blocks.start[near[i]], blocks.start[near[i] + 1]):
-            dm, dn = blocks.m[k] - m, blocks.n[k] - n
-            distance = dm * dm + dn * dn
-            in_a += distance <= limits.a
-            in_ab += distance <= limits.b
-            in_abc += distance <= limits.c
-        # Counts only grow: most cells on a wall or a fish need no further counting.
-        if in_abc > limits.max_in_ab + limits.max_in_c:
-            return False
-    in_c = in_abc - in_ab
-    return (
-        limits.min_in_a <= in_a <= limits.max_in_a
-        and in_ab <= limits.max_in_ab
-        and limits.min_in_c <= in_c <= limits.max_in_c
-    )
+    Parameters
+    ----------
+    strip, m, n : int array, shape (N,)
+        Cells, sorted by their strip, which is n // reach, then by m.
+    reach : int
+        Radius of region C in cells, rounded up.
+    squared_radii, dg
+        As in `MeshFilterOptions`.
+    keep : bool array, shape (N,)
+        Written.
+    """
+    a, b, c = squared_radii
+    first = np.zeros(3, np.int64)
+    for i in range(m.shape[0]):
+        in_a, in_ab, in_abc = 0, 0, 0
+        for s in range(3):
+            beside, k = strip[i] + s - 1, first[s]
+            while k < m.shape[0] and (
+                strip[k] < beside or (strip[k] == beside and m[k] < m[i] - reach)
+            ):
+                k += 1
+            first[s] = k
+            # Counts only grow: most cells on a wall or a fish need no further counting.
+            while (
+                k < m.shape[0] and strip[k] == beside and m[k] <= m[i] + reach and in_abc <= 3 * dg
+            ):
+                dm, dn = m[k] - m[i], n[k] - n[i]
+                distance = dm * dm + dn * dn
+                in_a += distance <= a
+                in_ab += distance <= b
+                in_abc += distance <= c
+                k += 1
+        in_c = in_abc - in_ab
+        keep[i] = (
+            (dg + 1) // 2 <= in_a <= dg and in_ab <= dg and (3 * dg + 1) // 2 <= in_c <= 2 * dg
+        )
 
 
 _FORWARD, _UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -406,29 +301,19 @@ def mesh_filter(
     """
     options = options or MeshFilterOptions()
     in_laser, usable = _usable_in_laser(points, plane, working_range)
-    cells = laser_cells(in_laser[usable], options.dd)
-    kept = np.empty(len(cells), dtype=np.bool_)
-    columns, rows = np.ascontiguousarray(cells.T)
-    keep_points(columns, rows, _limits(options), kept)
+    m, n = laser_cells(in_laser[usable], options.dd).T
+    reach = options.padding
+    strip = n // reach
+    order = np.lexsort((n, m, strip))
+    m, n, strip = m[order], n[order], strip[order]
+    distinct = np.ones(len(order), dtype=np.bool_)
+    distinct[1:] = (np.diff(m) != 0) | (np.diff(n) != 0)
+    kept = np.empty(np.count_nonzero(distinct), dtype=np.bool_)
+    lit = strip[distinct], m[distinct], n[distinct]
+    keep_cells(*lit, reach, options.squared_radii, options.dg_theta, kept)
     keep = np.zeros(len(usable), dtype=np.bool_)
-    keep[usable] = kept
+    keep[np.flatnonzero(usable)[order]] = kept[np.cumsum(distinct) - 1]
     return keep
-
-
-def _limits(options: MeshFilterOptions) -> Limits:
-    a, b, c = options.squared_radii
-    dg = options.dg_theta
-    return Limits(
-        a=a,
-        b=b,
-        c=c,
-        min_in_a=math.ceil(dg / 2),
-        max_in_a=dg,
-        max_in_ab=dg,
-        min_in_c=math.ceil(3 * dg / 2),
-        max_in_c=2 * dg,
-        reach=options.padding,
-    )
 
 
 def _usable_in_laser(
