@@ -8,7 +8,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.plane_fit import PlaneFit, fit_robust, shared_error
-from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
+from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_of
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -53,8 +53,8 @@ class Target:
 
 def posture_from_fit(fit: PlaneFit, points: np.ndarray, camera_axis_in_dome: np.ndarray) -> Posture:
     """The posture of a fit to points that all count (paper, Eq. 23-26), without validation."""
-    n_points, nearest = count_inliers(points, np.ones(len(points)))
-    return posture_of(fit, nearest, n_points, camera_axis_in_dome)
+    nearest = float(np.linalg.norm(points, axis=1).min())
+    return posture_of(fit, nearest, len(points), camera_axis_in_dome)
 
 
 class Diver:

@@ -40,31 +40,13 @@ from aqualvs.optics.port_projection import (
 
 
 @inline_kernel
-def opencv_pixel(lens: LensParams, x: float, y: float, z: float) -> tuple[bool, float, float]:
-    """Return (valid, u, v) of a direction of any length, without branches."""
-    inverse = 1.0 / z
-    xn, yn = x * inverse, y * inverse
-    xd, yd, _, _, _ = opencv_distort(lens, xn, yn)
-    valid = (z > 0.0) & (xn * xn + yn * yn < lens.limit)
-    return valid, lens.fx * xd + lens.cx, lens.fy * yd + lens.cy
-
-
-@inline_kernel
-def fisheye_pixel(lens: LensParams, x: float, y: float, z: float) -> tuple[bool, float, float]:
-    """Return (valid, u, v) of a direction of any length."""
-    radius = math.sqrt(x * x + y * y)
-    theta = math.atan2(radius, z)
-    value, _ = fisheye_distort(lens, theta)
-    scale = value / radius if radius > 0.0 else 1.0 / z
-    valid = theta < lens.limit and 0.0 < x * x + y * y + z * z < math.inf
-    return valid, lens.fx * x * scale + lens.cx, lens.fy * y * scale + lens.cy
-
-
-@inline_kernel
-def opencv_pixel_jacobian(
+def opencv_pixel(
     lens: LensParams, x: float, y: float, z: float
 ) -> tuple[bool, float, float, Vec, Vec]:
-    """Return (valid, u, v, gradient of u, gradient of v) of a direction, without branches."""
+    """Return (valid, u, v, gradient of u, gradient of v) of a direction of any length.
+
+    Without branches; LLVM drops gradients that a caller does not use.
+    """
     inverse = 1.0 / z
     xn, yn = x * inverse, y * inverse
     xd, yd, j_xx, j_xy, j_yy = opencv_distort(lens, xn, yn)
@@ -79,10 +61,10 @@ def opencv_pixel_jacobian(
 
 
 @inline_kernel
-def fisheye_pixel_jacobian(
+def fisheye_pixel(
     lens: LensParams, x: float, y: float, z: float
 ) -> tuple[bool, float, float, Vec, Vec]:
-    """Return (valid, u, v, gradient of u, gradient of v) of a direction."""
+    """Return (valid, u, v, gradient of u, gradient of v) of a direction of any length."""
     radius = math.sqrt(x * x + y * y)
     theta = math.atan2(radius, z)
     value, slope = fisheye_distort(lens, theta)
@@ -111,7 +93,8 @@ def pixels_all(
     """Write pixels (N, 2) of directions (N, 3)."""
     for i in range(directions.shape[0]):
         x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-        ok, u, v = fisheye_pixel(lens, x, y, z) if lens.fisheye else opencv_pixel(lens, x, y, z)
+        seen = fisheye_pixel(lens, x, y, z) if lens.fisheye else opencv_pixel(lens, x, y, z)
+        ok, u, v, _, _ = seen
         valid[i] = ok
         pixels[i, 0] = u if ok else np.nan
         pixels[i, 1] = v if ok else np.nan
@@ -427,12 +410,12 @@ def project_all(
             w[PX + j], w[PY + j], w[PZ + j] = x, y, z
         if camera.lens.fisheye:
             for j in range(count):
-                seen, u, v = fisheye_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+                seen, u, v, _, _ = fisheye_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
                 w[PX + j], w[PY + j] = u, v
                 w[OK + j] = w[OK + j] if seen else -1.0
         else:
             for j in range(BLOCK):
-                seen, u, v = opencv_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+                seen, u, v, _, _ = opencv_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
                 w[PX + j], w[PY + j] = u, v
                 w[OK + j] = w[OK + j] if seen else -1.0
         for j in range(count):
@@ -462,11 +445,11 @@ def pixels_jacobian_block(camera: CameraParams, count: int, w: FloatArray) -> No
         w[CX + j], w[CY + j], w[CZ + j] = x, y, z
     if lens.fisheye:
         for j in range(count):
-            seen = fisheye_pixel_jacobian(lens, w[CX + j], w[CY + j], w[CZ + j])
+            seen = fisheye_pixel(lens, w[CX + j], w[CY + j], w[CZ + j])
             _store_pixel_jacobian(camera, w, j, seen)
         return
     for j in range(BLOCK):
-        seen = opencv_pixel_jacobian(lens, w[CX + j], w[CY + j], w[CZ + j])
+        seen = opencv_pixel(lens, w[CX + j], w[CY + j], w[CZ + j])
         _store_pixel_jacobian(camera, w, j, seen)
 
 

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import python_of
+from aqualvs.geometry.linear_algebra import cross
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import POSE_PARAMETERS, Camera, Housing
@@ -248,6 +250,10 @@ def combined(one: RigUncertainty, other: RigUncertainty) -> RigUncertainty:
     return RigUncertainty(names, both[np.ix_(rows, rows)])
 
 
+# `np.cross` takes ten times as long for one vector.
+_cross = python_of(cross)
+
+
 def tangent_basis(normal: FloatArray) -> FloatArray:
     """Return two unit vectors (2, 3) at right angles to a unit normal (3,) and to each other.
 
@@ -260,12 +266,6 @@ def tangent_basis(normal: FloatArray) -> FloatArray:
     first = np.array(_cross(across, axis))
     first /= np.linalg.norm(first)
     return np.array([first, _cross(across, first.tolist())])
-
-
-def _cross(a: Sequence[float], b: Sequence[float]) -> list[float]:
-    """Return a x b; `np.cross` takes ten times as long for one vector."""
-    (ax, ay, az), (bx, by, bz) = a, b
-    return [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
 
 
 def moved_plane(plane: Plane, tilt_1: float, tilt_2: float, offset: float) -> Plane:

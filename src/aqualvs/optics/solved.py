@@ -22,6 +22,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import reduce
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -36,6 +37,7 @@ from aqualvs.optics.rig import (
     LASER_WINDOW_PARAMETERS,
     Rig,
     RigUncertainty,
+    combined,
     rig_parameter_names,
 )
 
@@ -393,15 +395,7 @@ def completed_uncertainty(rig: Rig) -> RigUncertainty:
 
     Raises `RigError` as `rig_uncertainty` does.
     """
-    parts = (rig_uncertainty(rig), *(one.uncertainty for one in assumptions(rig)))
-    names = tuple(name for part in parts for name in part.names)
-    covariance = np.zeros((len(names), len(names)))
-    first = 0
-    for part in parts:
-        stop = first + len(part.names)
-        covariance[first:stop, first:stop] = part.covariance
-        first = stop
-    return RigUncertainty(names, covariance)
+    return reduce(combined, (one.uncertainty for one in assumptions(rig)), rig_uncertainty(rig))
 
 
 def _defaults(rig: Rig) -> Iterator[Assumption]:

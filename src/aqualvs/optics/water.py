@@ -19,24 +19,10 @@ GREEN_NM = 532.0
 """Wavelength of a frequency-doubled Nd:YAG laser in vacuum, nanometres."""
 
 
-class _QuanFry(NamedTuple):
-    """Coefficients of the formula of Quan and Fry (1995), and the water for which it holds."""
-
-    n0: float = 1.31405
-    n1: float = 1.779e-4
-    n2: float = -1.05e-06
-    n3: float = 1.6e-8
-    n4: float = -2.02e-06
-    n5: float = 15.868
-    n6: float = 0.01155
-    n7: float = -0.00423
-    n8: float = -4382.0
-    n9: float = 1.1455e6
-    warmest_c: float = 30.0
-    saltiest: float = 40.0  # Per mille.
-
-
-_FORMULA = _QuanFry()
+# Coefficients n0 to n9 of the formula.
+_N = (1.31405, 1.779e-4, -1.05e-6, 1.6e-8, -2.02e-6, 15.868, 0.01155, -0.00423, -4382.0, 1.1455e6)
+# The warmest (degrees Celsius) and saltiest (per mille) water for which it holds.
+_WARMEST_C, _SALTIEST = 30.0, 40.0
 
 
 class IndexSlopes(NamedTuple):
@@ -72,13 +58,9 @@ def seawater_index(
         If a value lies outside its range or is not a number.
     """
     t, s, w = _checked(temperature_c, salinity_permille, wavelength_nm)
-    index: FloatArray = np.asarray(
-        _FORMULA.n0
-        + (_FORMULA.n1 + (_FORMULA.n2 + _FORMULA.n3 * t) * t) * s
-        + _FORMULA.n4 * t * t
-        + (_FORMULA.n5 + _FORMULA.n6 * s + _FORMULA.n7 * t + (_FORMULA.n8 + _FORMULA.n9 / w) / w)
-        / w
-    )
+    n0, n1, n2, n3, n4, n5, n6, n7, n8, n9 = _N
+    by_light = (n5 + n6 * s + n7 * t + (n8 + n9 / w) / w) / w
+    index: FloatArray = np.asarray(n0 + (n1 + (n2 + n3 * t) * t) * s + n4 * t * t + by_light)
     return index
 
 
@@ -101,18 +83,17 @@ def seawater_index_slopes(
 ) -> IndexSlopes:
     """Return how `seawater_index` changes with temperature and salinity; parameters as there."""
     t, s, w = _checked(temperature_c, salinity_permille, wavelength_nm)
+    _, n1, n2, n3, n4, _, n6, n7, _, _ = _N
     return IndexSlopes(
-        np.asarray(
-            (_FORMULA.n2 + 2.0 * _FORMULA.n3 * t) * s + 2.0 * _FORMULA.n4 * t + _FORMULA.n7 / w
-        ),
-        np.asarray(_FORMULA.n1 + (_FORMULA.n2 + _FORMULA.n3 * t) * t + _FORMULA.n6 / w),
+        np.asarray((n2 + 2.0 * n3 * t) * s + 2.0 * n4 * t + n7 / w),
+        np.asarray(n1 + (n2 + n3 * t) * t + n6 / w),
     )
 
 
 def _checked(*values: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     ranges = (
-        ("water temperature", "°C", 0.0, _FORMULA.warmest_c),
-        ("salinity", "per mille", 0.0, _FORMULA.saltiest),
+        ("water temperature", "°C", 0.0, _WARMEST_C),
+        ("salinity", "per mille", 0.0, _SALTIEST),
         ("wavelength", "nm", 400.0, 700.0),
     )
     arrays = []
@@ -135,27 +116,26 @@ def water_fault(temperature_c: float | None, salinity_permille: float | None) ->
 
     None was not given. Returns "temperature_c" or "salinity" and the remedy, or two empty texts.
     """
-    warmest_c, saltiest, least_salt = _FORMULA.warmest_c, _FORMULA.saltiest, 0.1
-    fahrenheit_from, kelvin_from = 40.0, 200.0
-    if temperature_c is not None and not 0.0 <= temperature_c <= warmest_c:
+    least_salt, fahrenheit_from, kelvin_from = 0.1, 40.0, 200.0
+    if temperature_c is not None and not 0.0 <= temperature_c <= _WARMEST_C:
         celsius, unit = temperature_c - 273.15, "kelvin"
         if temperature_c < kelvin_from:
             celsius, unit = (temperature_c - 32.0) / 1.8, "degrees Fahrenheit"
         hint = ""
-        if temperature_c >= fahrenheit_from and 0.0 <= celsius <= warmest_c:
+        if temperature_c >= fahrenheit_from and 0.0 <= celsius <= _WARMEST_C:
             hint = f"; {celsius:.4g} if {unit} are meant"
-        elif warmest_c < temperature_c < fahrenheit_from:
+        elif _WARMEST_C < temperature_c < fahrenheit_from:
             hint = "; for warmer water give its refractive index instead"
-        return "temperature_c", f"give degrees Celsius, from 0 to {warmest_c:g}{hint}"
+        return "temperature_c", f"give degrees Celsius, from 0 to {_WARMEST_C:g}{hint}"
     if salinity_permille is None or salinity_permille == 0.0:
         return "", ""
-    remedy = f"give per mille, from 0 to {saltiest:g}"
+    remedy = f"give per mille, from 0 to {_SALTIEST:g}"
     if 0.0 < salinity_permille < least_salt:
         # Fresh water has 0.05 to 0.5; less than 0.1 changes the index by 2e-5.
         share = 1e3 * salinity_permille
-        hint = f", {share:g} if a share is meant" if share <= saltiest else ""
+        hint = f", {share:g} if a share is meant" if share <= _SALTIEST else ""
         return "salinity", f"{remedy}: 0 for fresh water{hint}"
-    return ("", "") if 0.0 < salinity_permille <= saltiest else ("salinity", remedy)
+    return ("", "") if 0.0 < salinity_permille <= _SALTIEST else ("salinity", remedy)
 
 
 def index_in_seawater(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_kernel, kernel
+from aqualvs.geometry.compiled import ZERO, inline_borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import median_of, n_bins, squared
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
@@ -138,46 +138,23 @@ def _observe(
     focal_px: float,
     on_twine: bool,
 ) -> Observed:
-    """Average the units of stripe on a target, given the lasers' sheets."""
-    group = np.empty(unit.shape[0], np.int64)
-    n, n_candidates = _select_units(
-        candidates, unit, min_lines, on_target, m, planes, bent, focal_px, group
-    )
-    return Observed(group, n_candidates, average_groups(candidates, group, n, normal, on_twine))
-
-
-@inner_kernel
-def _select_units(
-    candidates: Candidates,
-    unit: IntArray,
-    min_lines: int,
-    on_target: BoolArray,
-    m: FloatArray,
-    planes: FloatArray,
-    bent: FloatArray | None,
-    focal_px: float,
-    group: IntArray,
-) -> tuple[int, int]:
-    """Write the numbers of units on the target to `group` (N,), -1 elsewhere and in crossings.
+    """Average the units of stripe on a target, given the lasers' sheets.
 
     A unit counts as a whole if one of its candidates is on the target: the centroid of a part of a
-    strand's light would be off the sheet. Outside a crossing it must still be long enough. Return
-    the number of units and of candidates in them.
+    strand's light would be off the sheet. Outside a crossing it must still be long enough.
     """
     points, laser = candidates.points, candidates.laser
     number = _units_on(unit, min_lines, on_target)
     mean_width = _mean_widths(laser, candidates.width, unit, number, planes.shape[0])
-    lines = np.zeros(number.shape[0], np.int64)
+    group, lines = np.full(unit.shape[0], -1), np.zeros(number.shape[0], np.int64)
     for i in range(unit.shape[0]):
         p = unit[i]
-        group[i] = -1
         if number[p] != -1 and not in_crossing(
             points, i, laser[i], m, planes, bent, mean_width, focal_px
         ):
             group[i] = p
             lines[p] += 1
-    n_groups = 0
-    n_candidates = 0
+    n_groups, n_candidates = ZERO, 0
     for i in range(unit.shape[0]):
         p = group[i]
         if p == -1:
@@ -190,7 +167,8 @@ def _select_units(
             n_groups += 1
         group[i] = number[p]
         n_candidates += 1
-    return n_groups, n_candidates
+    seen = average_groups(candidates, group, n_groups, normal, on_twine)
+    return Observed(group, n_candidates, seen)
 
 
 @inner_kernel

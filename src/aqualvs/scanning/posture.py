@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import lazy_borrowing_kernel
 from aqualvs.optics.rig_covariance import posture_by_plane
 from aqualvs.scanning.plane_fit import PlaneFit
 
@@ -223,15 +222,3 @@ def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
     """Return range (m), pitch and yaw (rad) of m·X = 1 (paper, Eq. 25-26 as arctangents)."""
     x, y, z = m.tolist()
     return 1.0 / math.hypot(x, y, z), math.atan2(z, y), math.atan2(x, y)
-
-
-@lazy_borrowing_kernel
-def count_inliers(points: FloatArray, weights: FloatArray) -> tuple[int, float]:
-    """Return the number of points (N, 3) with a weight, and the distance of the nearest (m)."""
-    n, square = 0, np.inf
-    for i in range(points.shape[0]):
-        if weights[i] > 0.0:
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            square = min(square, x * x + y * y + z * z)
-            n += 1
-    return n, np.sqrt(square)

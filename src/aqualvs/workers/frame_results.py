@@ -14,8 +14,14 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
-from aqualvs.scanning.plane_fit import PlaneFit, fit_robust, plane_of_all, shared_error
-from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
+from aqualvs.scanning.plane_fit import (
+    PlaneFit,
+    fit_robust,
+    mark_inliers,
+    plane_of_all,
+    shared_error,
+)
+from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_of
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
@@ -63,10 +69,12 @@ class BareLensComparison:
         found, sensitivity = placed.points_in_dome[valid], placed.sensitivity[valid]
         if len(found) < _MIN_POINTS:
             return Refusal(Reason.TOO_FEW_POINTS, "a bare lens would see too few of the points")
-        fit = self._fit(found, sensitivity, laser[valid])
+        laser = laser[valid]
+        fit = self._fit(found, sensitivity, laser)
         if fit is None:
             return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
-        n_points, nearest = count_inliers(found, fit.weights)
+        group, inliers = np.arange(len(found)), np.empty(len(found), np.bool_)
+        n_points, nearest, _ = mark_inliers(group, laser, fit.weights, False, found, inliers)
         return posture_of(fit, nearest, n_points, self._axis_in_dome)
 
     @staticmethod
