@@ -294,15 +294,11 @@ class _InnerKernel(_Kernel):
     def _for_python(self) -> Callable[..., Any]:
         # Numba names cache files by qualified name: under the same one, a process could load the
         # code without a wrapper for Python, and crash.
-        function = self.py_func
+        f = self.py_func
         own = types.FunctionType(
-            function.__code__,
-            function.__globals__,
-            function.__name__,
-            function.__defaults__,
-            function.__closure__,
+            f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__
         )
-        functools.update_wrapper(own, function)
+        functools.update_wrapper(own, f)
         own.__qualname__ += "_for_python"
         return _compiled(own, **self._options)
 

@@ -51,16 +51,10 @@ def rotvec_from_rotation(rotations: ArrayLike) -> FloatArray:
     four_sq = np.stack(
         [1.0 + trace] + [1.0 + 2.0 * r[..., i, i] - trace for i in range(3)], axis=-1
     )
-    wx, wy, wz = (
-        r[..., 2, 1] - r[..., 1, 2],
-        r[..., 0, 2] - r[..., 2, 0],
-        r[..., 1, 0] - r[..., 0, 1],
-    )
-    xy, yz, zx = (
-        r[..., 0, 1] + r[..., 1, 0],
-        r[..., 1, 2] + r[..., 2, 1],
-        r[..., 2, 0] + r[..., 0, 2],
-    )
+    transposed = np.swapaxes(r, -1, -2)
+    odd, even = r - transposed, r + transposed
+    wx, wy, wz = odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]
+    xy, yz, zx = even[..., 0, 1], even[..., 1, 2], even[..., 2, 0]
     rows = np.stack(
         [
             np.stack([four_sq[..., 0], wx, wy, wz], axis=-1),

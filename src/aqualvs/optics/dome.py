@@ -6,7 +6,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -99,11 +99,7 @@ class Dome:
 
     def numbers(self) -> dict[str, float]:
         """Return the sizes and the index by the names of their parameters."""
-        return {
-            "inner_radius": self.inner_radius,
-            "thickness": self.thickness,
-            "n_acrylic": self.n_acrylic,
-        }
+        return asdict(self)
 
     def moved_by(self, step: Mapping[str, float]) -> "Dome":
         """Return the dome with steps added to the parameters that are named."""

@@ -193,12 +193,6 @@ class Lens:
         fx, fy, cx, cy, *distortion = numbers
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
-    @property
-    def max_angle(self) -> float:
-        """Angle to the optical axis, in radians, inside which directions are valid."""
-        limit = self.params.limit
-        return limit if self.model is LensModel.FISHEYE else float(np.arctan(np.sqrt(limit)))
-
     def directions(self, pixels: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return the directions that pixels see.
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import dispatch_by_class, inline_kernel, kernel
-from aqualvs.geometry.linear_algebra import Vec, cross, dot
+from aqualvs.geometry.linear_algebra import Vec, combine, cross, dot
 from aqualvs.optics.camera import BareParams, CameraParams, rotate_to_dome
 from aqualvs.optics.dome import DomeParams
 from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatParams
@@ -189,12 +189,10 @@ def dome_directions_block(port: DomeParams, count: int, w: FloatArray) -> None:
             s = angle_sines(port, w[FAR + j])
             found, w[COS_A + j], w[SIN_A + j] = bisect_dome(s, n_l, w[COS_T + j], w[SIN_T + j])
             w[OK + j] = 1.0 if found else -1.0
-    ax, ay, az = port.axis
     for j in range(BLOCK):
-        c, k = w[COS_A + j], w[SIN_A + j]
-        w[PX + j] = c * ax + k * w[EX + j]
-        w[PY + j] = c * ay + k * w[EY + j]
-        w[PZ + j] = c * az + k * w[EZ + j]
+        e = (w[EX + j], w[EY + j], w[EZ + j])
+        x, y, z = blend(w[COS_A + j], port.axis, w[SIN_A + j], e)
+        w[PX + j], w[PY + j], w[PZ + j] = x, y, z
 
 
 @inline_kernel
@@ -212,15 +210,12 @@ def flat_directions_block(port: FlatParams, count: int, w: FloatArray) -> None:
         if w[OK + j] == 0.0:
             found, w[SIN_A + j] = bisect_flat(port, w[FAR + j], w[SIN_T + j])
             w[OK + j] = 1.0 if found else -1.0
-    mx, my, mz = port.normal
     for j in range(BLOCK):
         t = w[SIN_A + j]
         c = 1.0 / math.sqrt(1.0 + t * t)
-        s = t * c
-        w[COS_A + j], w[SIN_A + j] = c, s
-        w[PX + j] = c * mx + s * w[EX + j]
-        w[PY + j] = c * my + s * w[EY + j]
-        w[PZ + j] = c * mz + s * w[EZ + j]
+        w[COS_A + j], w[SIN_A + j] = c, t * c
+        x, y, z = blend(c, port.normal, t * c, (w[EX + j], w[EY + j], w[EZ + j]))
+        w[PX + j], w[PY + j], w[PZ + j] = x, y, z
 
 
 port_directions_block = dispatch_by_class(
@@ -311,11 +306,7 @@ def flat_gradients_block(port: FlatParams, w: FloatArray) -> None:
             g_u = dot(g, back.turn)
             by_reach, by_across = g_u * back.by_reach, dot(g, across) * back.across_point
             by_height = -by_reach * back.water_tangent
-            by_point = (
-                by_reach * e[0] + by_height * m[0] + by_across * across[0],
-                by_reach * e[1] + by_height * m[1] + by_across * across[1],
-                by_reach * e[2] + by_height * m[2] + by_across * across[2],
-            )
+            by_point = combine(e, by_reach, m, by_height, across, by_across)
             by_turn = cross(by_point, p)
             by_normal = blend(1.0, cross(d, g), 1.0, by_turn)
             x, y, z = by_point

@@ -309,16 +309,7 @@ def _propagate(
 ) -> None:
     """Write the derivatives J (3, P) of range, pitch and yaw by the rig's parameters, and J C J^T.
 
-    Parameters
-    ----------
-    surface, pixels, laser, points, weights
-        As in `PostureErrors.propagate`.
-    n_lasers, each : int
-        Number of lasers, and the largest number of short segments for each.
-    rig_errors : _RigErrors
-        With P parameters.
-    jacobian : array, shape (3, P), covariance : array, shape (3, 3)
-        Written; the second zero at first.
+    Arguments as of `PostureErrors.propagate`; `covariance` (3, 3) is zero at first.
     """
     sums = _sum_up(pixels, laser, points, weights, surface.terms, surface.prior, n_lasers, each)
     n, n_terms = jacobian.shape[1], surface.terms.shape[1]

@@ -371,10 +371,9 @@ class Sheet:
         start = Plane(self._row[START : START + 3].copy(), float(self._row[START + 3]))
         if len(points) < 3:
             return start
-        middle = points.mean(axis=0)
-        normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
-        normal = normal if normal @ start.normal > 0.0 else -normal
-        return Plane.from_normal(normal, float(normal @ middle))
+        found = Plane.fitted(points)
+        sign = 1.0 if found.normal @ start.normal > 0.0 else -1.0
+        return Plane.from_normal(sign * found.normal, sign * found.offset)
 
     def shine(self, directions: ArrayLike) -> tuple[Rays, FloatArray]:
         """Trace light from the source through the window.
@@ -397,8 +396,7 @@ class Sheet:
         ValueError
             If there is no window.
         """
-        if self.window is None:
-            raise ValueError("a sheet without a window has no source")
+        source = self.source
         d, face = as_vectors(directions, 3, "directions"), self._row[FACE : FACE + 3]
         ahead = d @ face
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -406,7 +404,7 @@ class Sheet:
         bent, through = refract(d, -face, n_in=self.n_air, n_out=self.n_water)
         valid = through & np.isfinite(way)
         bent = np.where(valid[..., None], bent, np.nan)
-        return Rays(self.source + way[..., None] * d, bent, valid), way
+        return Rays(source + way[..., None] * d, bent, valid), way
 
     def signed_distance_with_parameter_jacobian(
         self, points: ArrayLike

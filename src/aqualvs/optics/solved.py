@@ -19,7 +19,7 @@ Numbers that were never calibrated, such as those written by hand, get stated de
 
 import difflib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import reduce
@@ -358,8 +358,6 @@ SIGMAS = DefaultSigmas()
 
 
 _LENS = ("lens_x", "lens_y", "lens_z")
-_SHELL = ("inner_radius", "thickness", "n_acrylic")
-_FLAT = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,7 +383,7 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
     for one in _defaults(rig):
         names = one.uncertainty.names
         # The calibration of the dome decides which of its sizes are uncertain.
-        if known.isdisjoint((*names, *_LENS) if names[0] in _SHELL else names):
+        if known.isdisjoint((*names, *_LENS) if one.what == "dome" else names):
             found.append(one)
     return tuple(found)
 
@@ -407,7 +405,7 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
         yield _independent(
             "dome",
             f"{SIGMAS.radius_m * 1e3:g} mm in radius and thickness, {SIGMAS.n_acrylic:g} in index",
-            _SHELL,
+            rig.dome.numbers(),
             (SIGMAS.radius_m, SIGMAS.thickness_m, SIGMAS.n_acrylic),
         )
     if rig.flat_port is not None:
@@ -416,7 +414,7 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
             "flat port",
             f"{lens} in distance, {thickness} in thickness, {SIGMAS.n_acrylic:g} in index, "
             f"{math.degrees(tilt):g} degrees in tilt",
-            _FLAT,
+            rig.flat_port.numbers(),
             (SIGMAS.lens_m, SIGMAS.thickness_m, SIGMAS.n_acrylic, tilt, tilt),
         )
     refracts = rig.housing is not None or any(laser.window is not None for laser in rig.lasers)
@@ -433,7 +431,7 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
 
 
 def _independent(
-    group: str, words: str, names: Sequence[str], sigmas: Sequence[float]
+    group: str, words: str, names: Iterable[str], sigmas: Sequence[float]
 ) -> Assumption:
     sigma_of = dict(zip(names, sigmas, strict=True))
     return Assumption(group, words, RigUncertainty.independent(sigma_of))

@@ -112,22 +112,10 @@ def label_target(
 
     Parameters
     ----------
-    candidates : Candidates
-        N of them.
-    of_candidate : int array, shape (N,)
-        Row of each one's subsegment.
-    members : bool array, shape (C,)
-        Subsegments on the target.
-    is_mesh : bool
-        As in `Surface`.
-    target : array, shape (16,)
-        The surface as a patch.
+    candidates, of_candidate, members, is_mesh, target, explained, label
+        As of `label_other`, after it, for the surface that is the target.
     inliers, net_mask : bool array, shape (N,)
         As in `Measurement`; the second empty where there is none.
-    explained : bool array, shape (N,)
-        Candidates on other surfaces; completed in place.
-    label : uint8 array, shape (N,)
-        Completed in place.
     """
     source = candidates.source
     n = source.shape[0]
@@ -179,12 +167,8 @@ def label_loose(
 
     Parameters
     ----------
-    candidates : Candidates
-        N of them.
-    shapes : ComponentShapes
-        Of their components.
-    target : array, shape (16,)
-        The target as a patch; empty where there is none.
+    candidates, shapes, target
+        As of `label_other`.
     working_range : (float, float)
         Distances from the dome's centre beyond which clutter is out of range, in metres.
     explained : bool array, shape (N,)

@@ -347,15 +347,8 @@ def _widen_along_strands(seen: Observations, lines: IntArray, spread: FloatArray
     Such a strand need not cross the middle of the sheet: its light lies where the strand is. Thin
     twine shows less than the sheet's full width there, and the rest is where the middle may be. A
     strand that crosses all of the sheet at a small angle spreads as far as the sheet is wide.
-
-    Parameters
-    ----------
-    seen : Observations
-        M of them.
-    lines : int array, shape (M,)
-        Search lines of each.
-    spread : array, shape (M,)
-        Variance of the positions of its peaks about their mean, in px².
+    `lines` (M,) is the number of search lines of each of M strands, `spread` (M,) the variance of
+    the positions of its peaks about their mean, in px².
     """
     # A strand lies along the sheet if its light is longer than so many of its widths, and narrower
     # than this share of the sheet.

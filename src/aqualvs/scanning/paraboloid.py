@@ -29,12 +29,11 @@ from aqualvs.scanning.patch import (
     COEFFICIENTS,
     NORMAL,
     OFFSET,
-    RIGHT,
     SIGMA_CURVATURE,
     SIGMA_TWIST,
-    UP,
     nearest_tangent,
     packed_plane,
+    write_terms,
 )
 from aqualvs.scanning.patch import N_COEFFICIENTS as N
 from aqualvs.scanning.plane_fit import TUKEY, SharedError, add_error
@@ -169,15 +168,12 @@ def over_plane(
     height, per_px : array, shape (M,)
         Written: distance behind the plane, and its change by the stripe's position.
     """
+    write_terms(points, patch, terms)
     for i in range(points.shape[0]):
-        u, v, h, d = 0.0, 0.0, -patch[OFFSET], 0.0
+        h, d = -patch[OFFSET], 0.0
         for k in range(3):
-            u += patch[RIGHT + k] * points[i, k]
-            v += patch[UP + k] * points[i, k]
             h += patch[NORMAL + k] * points[i, k]
             d += patch[NORMAL + k] * sensitivity[i, k]
-        terms[i, 0], terms[i, 1], terms[i, 2] = 1.0, u, v
-        terms[i, 3], terms[i, 4], terms[i, 5] = 0.5 * u * u, u * v, 0.5 * v * v
         height[i], per_px[i] = h, d
 
 

@@ -362,14 +362,9 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
     """Return the expected squared factor t on shared errors, given the residuals of a frame.
 
     The mean over `_SQUARES`, weighted by the marginal likelihood of normal errors with variance t
-    (Rasmussen and Williams 2006, Eq. 2.30) times the prior of t.
-
-    Parameters
-    ----------
-    matrix : array, shape (K, K)
-        Information of the frame on the K errors; lower triangle.
-    residual : array, shape (K,)
-        The same times their estimate.
+    (Rasmussen and Williams 2006, Eq. 2.30) times the prior of t. `matrix` (K, K) is the information
+    of the frame on the K errors, in its lower triangle; `residual` (K,) is that times their
+    estimate.
     """
     # Prior: the logarithm of the standard deviation has that of this factor as its own. Rendered
     # walls have 0.01 to 0.06 px, the most with strong compression.

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,9 +104,6 @@ _EXPECTED, _CONTRADICTS = 3.0, 16.27
 _MIN_OBSERVATIONS = 3
 
 
-S = TypeVar("S", bound=np.generic)
-
-
 class FitMethod(StrEnum):
     """Method of the plane fit to the target's points."""
 
@@ -143,7 +140,7 @@ class Measurement:
     def among(self, mask: BoolArray) -> "Measurement":
         """Return the measurement of the candidates that a mask (M,) selects, among all M."""
 
-        def spread(column: NDArray[S]) -> NDArray[S]:
+        def spread(column: NDArray[Any]) -> NDArray[Any]:
             whole = np.zeros(len(mask), column.dtype)
             whole[mask] = column
             return whole
@@ -251,9 +248,10 @@ class PostureEstimator:
             is_observable = self._is_observable(candidates, curved)
             if is_clear and is_observable:
                 best = curved
-            elif is_clear or is_observable:
+            elif (is_clear or is_observable) and flat.posture and curved.posture:
                 # The nearest point is out of view, or the bend may be due to chance.
-                best = _inflated_by(flat, curved)
+                posture = inflate_covariance(flat.posture, curved.posture, 1.0)
+                best = replace(flat, posture=posture)
         patch = patch if best.patch is None else best.patch
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
         seen = self._observe_near(candidates, net_mask, off, plane)
@@ -587,9 +585,3 @@ def _may_bend(fit: PatchFit) -> bool:
     min_sigmas = 3.0  # Least significance of a curvature.
     curvature, variance = fit.patch[COEFFICIENTS + 3 :], np.diag(fit.covariance)[3:]
     return bool((curvature**2 > min_sigmas**2 * variance).any())
-
-
-def _inflated_by(found: Measurement, other: Measurement) -> Measurement:
-    """Inflate a posture's covariance by its difference from another one."""
-    one, two = found.posture, other.posture
-    return replace(found, posture=inflate_covariance(one, two, 1.0)) if one and two else found

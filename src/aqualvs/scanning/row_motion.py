@@ -228,19 +228,11 @@ class RowMotion:
 def _fit_rates(
     points: FloatArray, sigma: FloatArray, times: FloatArray, m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit the plane m·X = 1 at time 0 and the rate of m to points at different times.
+    """Return the plane m·X = 1 at time 0, and the rate of m, fitted to points at different times.
 
-    Parameters
-    ----------
-    points, sigma, times : array, shape (N, 3), (N,), (N,)
-        In `dome` (m); standard deviations of m·X; seconds.
-    m : array, shape (3,)
-        Initial m.
-
-    Returns
-    -------
-    m, m_rate : array, shape (3,)
-        In 1/m and 1/(m s); the initial m and zero if the points do not determine them.
+    `points` (N, 3) are in `dome`, in metres; `sigma` (N,) is that of m·X; `times` (N,) are in
+    seconds. Returns m (3,) in 1/m and its rate (3,) in 1/(m s): the initial `m` and zero if the
+    points do not determine them.
     """
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
     scaled = posture_by_plane(m) / _RATES[:, None]
@@ -307,18 +299,8 @@ def _sum_up(
 
     At time t a point lies on the plane m + t rate + t²/2 acceleration, and so off the plane m by
     the difference times X. The columns are for the rates, the accelerations, and the shift from
-    `seen` to `still`.
-
-    Parameters
-    ----------
-    terms, weights : array, shape (N, K), (N,)
-    seen, still : array, shape (N, 3)
-    times : array, shape (N,)
-        Middles of the exposures.
-    spread : float
-        Variance of the times within an exposure.
-    m : array, shape (3,)
-    matrix, moved : array, shape (K, K), (K, 7)
+    `seen` to `still`, both (N, 3). `times` (N,) are the middles of the exposures, `spread` is the
+    variance of the times within one.
     """
     n_terms = terms.shape[1]
     for i in range(len(weights)):
@@ -356,8 +338,7 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
     known = [(0.0, posture, posture.by_motion)]
     for one in beside:
         found, after = one.posture, one.time_s - scan.time_s
-        is_near = isinstance(found, Posture) and abs(after) <= _REACH_S
-        if is_near and isinstance(found, Posture) and found.by_motion is not None:
+        if isinstance(found, Posture) and abs(after) <= _REACH_S and found.by_motion is not None:
             known.append((after, found, found.by_motion))
     motion, covariance = np.empty(12), np.empty((12, 12))
     _estimate_motion(
@@ -388,18 +369,9 @@ def _estimate_motion(
     """Estimate posture and motion (12,) at the first of F frames, with their covariance (12, 12).
 
     Unknowns are the posture, relative to that measured in the first frame, its rates,
-    accelerations and jerks. Jerks during a picture are neglected.
-
-    Parameters
-    ----------
-    t : array, shape (F,)
-        Times from the first frame, in seconds.
-    numbers, covariances, by_motion : array, shape (F, 3), (F, 3, 3), (F, 3, 6)
-        Range, pitch and yaw, in m and rad; their covariance and derivative as in `Posture`.
-    variances : array, shape (9,)
-        Prior variances of rates, accelerations and jerks.
-    motion, covariance : array, shape (12,), (12, 12)
-        Written.
+    accelerations and jerks. Jerks during a picture are neglected. `t` (F,) are the times from the
+    first frame, in seconds; `numbers` (F, 3), `covariances` (F, 3, 3) and `by_motion` (F, 3, 6) are
+    as in `Posture`; `variances` (9,) are the prior ones of rates, accelerations and jerks.
     """
     matrix, right = np.zeros((12, 12)), np.zeros(12)
     for k in range(9):
