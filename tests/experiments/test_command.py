@@ -8,7 +8,7 @@ import pytest
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.experiments import experiment as catalogue
 from aqualvs.experiments import page as records
-from aqualvs.experiments.command import ReproduceRequest, TimeLeft, reproduce, time_left_text
+from aqualvs.experiments.command import TimeLeft, reproduce, time_left_text
 from aqualvs.experiments.experiment import (
     DataColumns,
     Experiment,
@@ -45,14 +45,14 @@ def experiment(name, *, met=True, fault=None, columns=None, sentence="Found 1.",
             notes=("Not the paper's tank.",),
         )
 
-    return Experiment(name=name, title=f"About {name}", paper="figure 1", about="A wall.", run=run)
+    return Experiment(title=f"About {name}", paper="figure 1", about="A wall.", run=run)
 
 
 def run(folder, *names, **faults):
     """Return exit code and lines; `faults` maps names to what goes wrong there."""
     lines = []
-    request = ReproduceRequest(names=names, out=folder)
-    code = reproduce(request, lines.append, lambda name: experiment(name, **faults.get(name, {})))
+    load = {name: experiment(name, **faults.get(name, {})) for name in names}
+    code = reproduce(names, folder, lines.append, load.__getitem__)
     return code, lines
 
 

@@ -111,7 +111,7 @@ def test_an_experiment_gives_its_results(
     few = {kind: sets[:: 4 if WHOLE else 8] for kind, sets in ablation_stages._KINDS.items()}
     monkeypatch.setattr(ablation_stages, "_KINDS", few)
     found = experiment(name)
-    record = save_outcome(found, found.run(laboratory), tmp_path)
+    record = save_outcome(name, found, found.run(laboratory), tmp_path)
     told = [record.sentence, *(row.ours for row in record.findings)]
     assert all(told)
     assert "nan" not in " ".join(told)

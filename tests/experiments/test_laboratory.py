@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from aqualvs.experiments.dome_or_not import Distances, _calibrated_without, distances, level_laser
-from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, Variant, numbers_text
+from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, numbers_text
 from aqualvs.experiments.mesh_filter import LitTruth, mean_score, score_pixels, score_reflections
 from aqualvs.scanning.paper.detector import FilteredPeaks
 from aqualvs.scanning.posture import Reason, Refusal
@@ -73,7 +73,7 @@ def refused(n=2):
 
 
 def test_frames_without_a_posture_have_no_error():
-    one = Variant("dark", (refused(),))
+    one = refused()
     assert one.valid_percent == 0.0
     assert np.isnan(one.rms).all()
     assert numbers_text(one.rms) == "-, -, -"
@@ -113,8 +113,8 @@ def test_the_laboratory_knows_the_truth(seen):
     assert measured.valid.all()
     assert measured.truth[:, 0] == pytest.approx([0.35, 0.5])
     # A still wall in clear water: some hundredths of a percent and of a degree.
-    assert np.abs(measured.range_percent).max() < 0.05
-    assert np.degrees(np.abs(measured.errors[:, 1:])).max() < 0.2
+    assert np.abs(measured.errors[:, 0]).max() < 0.05
+    assert np.abs(measured.errors[:, 1:]).max() < 0.2
     assert (measured.sigmas > 0.0).all()
 
 

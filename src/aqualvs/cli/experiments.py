@@ -86,5 +86,4 @@ def reproduce(
     if list_:
         body.print_experiments(typer.echo)
         return
-    request = body.ReproduceRequest(names=tuple(experiments or ()), out=out)
-    raise typer.Exit(body.reproduce(request, typer.echo))
+    raise typer.Exit(body.reproduce(experiments or (), out, typer.echo))

@@ -42,7 +42,7 @@ def _run_video(laboratory: Laboratory) -> ExperimentResult:
     for crf in crfs:
         dive = laboratory.dive(course, recording=Compression(crf=crf))
         variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == default))
-    first, last = variants[1], variants[-1]
+    first, last = variants[1].measured, variants[-1].measured
     at_last = f"it is {last.rms[0]:.3f} %" if last.valid_percent else "no frame has a posture"
     return compared(
         "ablation_video",
@@ -50,18 +50,18 @@ def _run_video(laboratory: Laboratory) -> ExperimentResult:
         "qualities of H.264.",
         variants,
         sentence=f"Against uncompressed pictures H.264 of good quality changes the range error "
-        f"from {variants[0].rms[0]:.3f} to {first.rms[0]:.3f} %; at {last.name} {at_last}.",
+        f"from {variants[0].measured.rms[0]:.3f} to {first.rms[0]:.3f} %; at {variants[-1].name} "
+        f"{at_last}.",
     )
 
 
 def _variant(laboratory: Laboratory, dive: RenderedDive, name: str, ours: bool = False) -> Variant:
     frames = dive.scenario.n_frames
     rate = 8e-6 * dive.video.stat().st_size * dive.scenario.fps / frames
-    return Variant(f"{name}, {rate:.1f} Mbit/s", (laboratory.measure(dive),), ours)
+    return Variant(f"{name}, {rate:.1f} Mbit/s", laboratory.measure(dive), ours)
 
 
 VIDEO = Experiment(
-    name="video",
     title="What H.264 costs",
     about="The same pictures of a clear net, uncompressed and as H.264 at four qualities.",
     run=_run_video,
@@ -91,8 +91,8 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
     flat = _with_best_planes(bent)
     dive = laboratory.dive(before_wall(), bent)
     variants = [
-        Variant("refracted sheets", (laboratory.measure(dive),), ours=True),
-        Variant("planes that fit them best", (laboratory.measure(dive, rig=flat),)),
+        Variant("refracted sheets", laboratory.measure(dive), ours=True),
+        Variant("planes that fit them best", laboratory.measure(dive, rig=flat)),
     ]
     off = _off_plane_mm(bent)
     return compared(
@@ -101,7 +101,7 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
         variants,
         sentence=f"Behind windows tilted by 12 to 25 degrees the light deviates from its best "
         f"plane by up to {max(off):.1f} mm; with planes the range error is "
-        f"{variants[1].rms[0]:.2f} % instead of {variants[0].rms[0]:.3f} %.",
+        f"{variants[1].measured.rms[0]:.2f} % instead of {variants[0].measured.rms[0]:.3f} %.",
         more_findings=[
             ExperimentRow(
                 what=f"laser behind a window tilted by {tilt:g} degrees: farthest from its best "
@@ -153,7 +153,6 @@ def _off_plane_mm(rig: Rig) -> list[float]:
 
 
 SHEETS = Experiment(
-    name="sheets",
     title="Why refracted laser sheets",
     about="Each laser of the rig is behind a flat window tilted relative to its beam; the wall is "
     "measured with the refracted-sheet model and with the planes of the paper's Eq. 19.",
@@ -237,7 +236,7 @@ def _with_lens(rig: Rig, axis: int, step_mm: float) -> Rig:
 
 def _worst(laboratory: Laboratory, dive: RenderedDive, rig: Rig) -> float:
     """Return the range error of largest magnitude, in percent, with its sign; NaN if none."""
-    percent = laboratory.measure(dive, rig=rig).range_percent
+    percent = laboratory.measure(dive, rig=rig).errors[:, 0]
     found = percent[np.isfinite(percent)]
     return float(found[np.argmax(np.abs(found))]) if len(found) else np.nan
 
@@ -261,7 +260,6 @@ def _draw_beliefs(figure: Figure, index: FloatArray, lens: FloatArray) -> None:
 
 
 BELIEFS = Experiment(
-    name="beliefs",
     title="What wrong assumptions cost",
     about="The wall at the paper's four distances, measured with the true rig except for one "
     "parameter: the index of the water, or the position of the lens in the dome.",

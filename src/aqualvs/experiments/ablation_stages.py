@@ -65,13 +65,12 @@ def _run_stripes(laboratory: Laboratory) -> ExperimentResult:
 
 def _sentence(variants: list[Variant], places: list[str]) -> str:
     """Return a sentence on each detector's result in its worst scene."""
-    shares = {
-        what: min(v.valid_percent for v in variants if v.name.startswith(what))
+    found = {
+        what: [v.measured for v in variants if v.name.startswith(what)]
         for what in ("sub-pixel", *(f"threshold {level}" for level in _LEVELS))
     }
-    worst = {
-        what: max(float(v.rms[0]) for v in variants if v.name.startswith(what)) for what in shares
-    }
+    shares = {what: min(m.valid_percent for m in dives) for what, dives in found.items()}
+    worst = {what: max(float(m.rms[0]) for m in dives) for what, dives in found.items()}
     ours = f"{worst['sub-pixel']:.2f} % in {shares['sub-pixel']:.0f} % of the frames"
     others = "; ".join(
         f"{what} has {numbers_text([worst[what]])} % in {shares[what]:.0f} %"
@@ -86,15 +85,14 @@ def _sentence(variants: list[Variant], places: list[str]) -> str:
 
 def _variants(laboratory: Laboratory, dive: RenderedDive, where: str) -> list[Variant]:
     ours = ScannerOptions(detector=StripeOptions())
-    found = [Variant(f"sub-pixel, {where}", (laboratory.measure(dive, ours),), ours=True)]
+    found = [Variant(f"sub-pixel, {where}", laboratory.measure(dive, ours), ours=True)]
     for level in _LEVELS:
         options = ScannerOptions(detector=ThresholdOptions(level=level))
-        found.append(Variant(f"threshold {level}, {where}", (laboratory.measure(dive, options),)))
+        found.append(Variant(f"threshold {level}, {where}", laboratory.measure(dive, options)))
     return found
 
 
 STRIPES = Experiment(
-    name="stripes",
     title="Why a sub-pixel detector",
     about="The wall at the paper's four distances, and the net in the sun, with the sub-pixel "
     "stripe detector and with fixed thresholds as in section 3.1.",
@@ -114,13 +112,14 @@ def _run_fits(laboratory: Laboratory) -> ExperimentResult:
     variants = [
         Variant(
             f"{fit}, {where}",
-            (laboratory.measure(dive, ScannerOptions(fit=method)),),
+            laboratory.measure(dive, ScannerOptions(fit=method)),
             ours=method is FitMethod.ROBUST,
         )
         for where, dive in dives.items()
         for fit, method in _FITS.items()
     ]
-    times = [b.rms[0] / a.rms[0] for a, b in zip(variants[::2], variants[1::2], strict=True)]
+    rms = [one.measured.rms[0] for one in variants]
+    times = [theirs / ours for ours, theirs in zip(rms[::2], rms[1::2], strict=True)]
     return compared(
         "ablation_fits",
         "Root mean square errors with the robust fit and with the pseudo-inverse of Eq. 24, on the "
@@ -136,7 +135,6 @@ def _run_fits(laboratory: Laboratory) -> ExperimentResult:
 
 
 FITS = Experiment(
-    name="fits",
     title="Why a robust fit",
     about="The points of the target in three dives, fitted robustly with their covariances, and "
     "with equal weights by pseudo-inverse.",
@@ -313,10 +311,10 @@ def _best(judged: Mapping[_Set, PrecisionRecall]) -> tuple[_Set, PrecisionRecall
 
 
 def _postures(laboratory: Laboratory, dive: RenderedDive, rows: Sequence[_Row]) -> list[Variant]:
-    variants = [Variant("adaptive", (laboratory.measure(dive),), ours=True)]
+    variants = [Variant("adaptive", laboratory.measure(dive), ours=True)]
     sets = [one for row in rows for one, _ in row.paper.values() if row.where.startswith("diamond")]
     for one in dict.fromkeys(sets):
-        variants.append(Variant(f"paper, {one.text}", (laboratory.measure(dive, one.scanner),)))
+        variants.append(Variant(f"paper, {one.text}", laboratory.measure(dive, one.scanner)))
     return variants
 
 
@@ -338,7 +336,6 @@ def _series(rows: Sequence[_Row]) -> DataColumns:
 
 
 FILTERS = Experiment(
-    name="filters",
     title="Why an adaptive mesh filter",
     about="Two nets at three ranges, and the net of the mesh experiment; a threshold and the "
     "paper's filter on every bright pixel, with its own and with other parameters, compared "

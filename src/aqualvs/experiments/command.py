@@ -8,7 +8,6 @@ import statistics
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -149,14 +148,6 @@ def time_left_text(seconds: float) -> str:
 Load: TypeAlias = Callable[[str], Experiment]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReproduceRequest:
-    """Request of `aqualvs reproduce`, see its `--help`."""
-
-    names: tuple[str, ...]  # Experiments; all of them if empty.
-    out: Path  # Folder to write.
-
-
 def print_experiments(echo: Echo) -> None:
     """Print the name, title and section of the paper of every experiment."""
     width = max(map(len, catalogue.MODULES))
@@ -165,25 +156,28 @@ def print_experiments(echo: Echo) -> None:
         echo(f"{name:<{width}}  {found.title} ({found.paper or 'an ablation'})")
 
 
-def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.experiment) -> int:
+def reproduce(
+    names: Sequence[str], out: Path, echo: Echo, load: Load = catalogue.experiment
+) -> int:
     """Run experiments, write the page after each of them, and return 0, or 1 if one failed.
 
-    Results of other experiments by the same version in the folder stay on the page. Raises
-    `OptionError` if a name is not known, `OutputError` if the folder cannot be written.
+    `names`: all experiments if empty. Results of other experiments by the same version in the
+    folder `out` stay on the page. Raises `OptionError` if a name is not known, `OutputError` if the
+    folder cannot be written.
     """
-    names = catalogue.ordered(request.names)
-    files = [request.out / name for name in FILES]
-    known = files if is_reproduced(request.out) else []
+    names = catalogue.ordered(names)
+    files = [out / name for name in FILES]
+    known = files if is_reproduced(out) else []
     claim = Claim("reproduce", files, overwrite=True, known=known)
     with experiment_bar(names) as bar:
-        laboratory = Laboratory(work_folder(request.out), bar.tick)
-        results = _Records(request.out)
+        laboratory = Laboratory(work_folder(out), bar.tick)
+        results = _Records(out)
         for number, name in enumerate(names, 1):
             bar.start(name)
             results.run(name, load, laboratory)
             echo(f"[{number}/{len(names)}] {_line(results.records[name], results.seconds[name])}")
             bar.end()
-            write_page(results.in_order(), results.seconds, request.out)
+            write_page(results.in_order(), results.seconds, out)
     claim.close()
     records = [results.records[name] for name in names]
     failed = [record.name for record in records if record.failure]
@@ -192,7 +186,7 @@ def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.expe
     bars = [bool(row.met) for _, row in with_bar(records)]
     took = sum(results.seconds[name] for name in names)
     echo(f"{sum(bars)} of {len(bars)} criteria met, {took:.0f} s")
-    echo(f"page: {request.out / PAGE}")
+    echo(f"page: {out / PAGE}")
     return int(bool(failed))
 
 
@@ -220,7 +214,7 @@ class _Records:
         kept = self.folder / FAILURES / f"{name}.txt"
         try:
             found = load(name)
-            record = save_outcome(found, found.run(laboratory), self.folder)
+            record = save_outcome(name, found, found.run(laboratory), self.folder)
         except OutputError:
             raise
         except Exception as fault:

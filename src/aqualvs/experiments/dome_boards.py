@@ -331,7 +331,6 @@ def _draw_arrows(
 
 
 EXPERIMENT = Experiment(
-    name="dome",
     title="Calibrating the dome from boards",
     paper="section 2.2, table 1, figures 3 and 4",
     about="Boards at measured distances in air, seen through the dome, give the position of the "

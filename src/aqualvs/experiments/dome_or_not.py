@@ -271,7 +271,6 @@ def _errors(
 
 
 EXPERIMENT = Experiment(
-    name="dome-or-not",
     title="With and without the dome model",
     paper="section 5.4, figures 19 and 20",
     about="A wall moves from 300 to 1250 mm and back. Three points of the level laser's stripe "

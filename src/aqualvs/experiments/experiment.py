@@ -88,7 +88,6 @@ class ExperimentResult:
 class Experiment:
     """Experiment of the paper, or an ablation."""
 
-    name: str  # On the command line.
     title: str
     paper: str = ""  # Section and figure of the paper; empty for an ablation.
     about: str  # The setting, in one or two sentences.

@@ -109,28 +109,6 @@ class MeasuredScene:
         """Return the share of those frames that have a posture."""
         return 100.0 * float(np.mean(measured.valid[self.asked])) if self.asked.any() else np.nan
 
-    @property
-    def errors(self) -> FloatArray:
-        """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
-        return self.ours.errors_in_units
-
-    @property
-    def rms(self) -> FloatArray:
-        """Root mean square of the errors, shape (3,)."""
-        return np.asarray(np.sqrt(np.nanmean(self.errors**2, axis=0)))
-
-    @property
-    def largest(self) -> FloatArray:
-        """Largest magnitudes of the errors, shape (3,)."""
-        return np.asarray(np.nanmax(np.abs(self.errors), axis=0))
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """Median stated sigmas in the same units, shape (3,)."""
-        percent = 100.0 * self.ours.sigmas[:, 0] / self.ours.truth[:, 0]
-        degrees = np.degrees(self.ours.sigmas[:, 1:])
-        return np.asarray(np.nanmedian(np.column_stack([percent, degrees]), axis=0))
-
 
 def scene(name: str) -> Scenario:
     """Return the dive before a "clear" net, one with "growth" in turbid water, or in the "sun"."""
@@ -150,7 +128,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         sentence=f"With growth on 60 % of the net {valid['growth']:.0f} %, in sunlight "
         f"{valid['sun']:.0f} % of the frames have a posture, where the paper's filter gives "
         f"{papers['growth']:.0f} and {papers['sun']:.0f} %; range within "
-        f"{seen['growth'].rms[0]:.2f} and {seen['sun'].rms[0]:.2f} % root mean square.",
+        f"{seen['growth'].ours.rms[0]:.2f} and {seen['sun'].ours.rms[0]:.2f} % root mean square.",
         findings=tuple(row for name in _SCENES for row in _findings(name, seen)),
         pictures=(
             drawn(
@@ -172,8 +150,8 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _findings(name: str, seen: Mapping[str, MeasuredScene]) -> list[ExperimentRow]:
-    one, clear = seen[name], seen["clear"]
-    valid, judged = one.valid_percent(one.ours), name != "clear"
+    one, judged = seen[name], name != "clear"
+    valid, rms, largest = one.valid_percent(one.ours), one.ours.rms, one.ours.largest
     limits = np.array(_CLEAR_LIMITS) * (2.0 if judged else 1.0)
     bar_valid = 90.0
     return [
@@ -187,15 +165,19 @@ def _findings(name: str, seen: Mapping[str, MeasuredScene]) -> list[ExperimentRo
         ),
         ExperimentRow(
             what=f"{name}: largest error of range (%), pitch, yaw (degrees)",
-            ours=listed(one.largest, 3),
+            ours=listed(largest, 3),
             bar="<= " + ", ".join(f"{limit:g}" for limit in limits),
-            met=bool(np.all(one.largest <= limits)),
+            met=bool(np.all(largest <= limits)),
         ),
         ExperimentRow(
             what=f"{name}: root mean square error, and as many times the clear scene's",
-            ours=listed(one.rms, 3) + (f"; {listed(one.rms / clear.rms, 1)}" if judged else ""),
+            ours=listed(rms, 3)
+            + (f"; {listed(rms / seen['clear'].ours.rms, 1)}" if judged else ""),
         ),
-        ExperimentRow(what=f"{name}: stated sigma (median)", ours=listed(one.sigmas, 3)),
+        ExperimentRow(
+            what=f"{name}: stated sigma (median)",
+            ours=listed(np.nanmedian(one.ours.error_sigmas, axis=0), 3),
+        ),
     ]
 
 
@@ -214,13 +196,10 @@ def _draw(figure: Figure, seen: Mapping[str, MeasuredScene]) -> None:
         picture.imshow(colours, interpolation="nearest")
         picture.set_title(name, loc="left")
         picture.set_axis_off()
-        degrees = np.degrees(one.ours.errors[:, 2])
-        percent_bar = 200.0 * one.ours.sigmas[:, 0] / one.ours.truth[:, 0]
-        bars = (percent_bar, 2.0 * np.degrees(one.ours.sigmas[:, 2]))
-        values = (one.ours.range_percent, degrees)
-        for axes, value, bar in zip(errors, values, bars, strict=True):
+        values, bars = one.ours.errors, 2.0 * one.ours.error_sigmas
+        for axes, k in zip(errors, (0, 2), strict=True):
             axes.axhline(0.0, color="#8a8f98", linewidth=0.7)
-            draw_dots(axes, one.ours.time_s, value, bar, _COLOURS[name])
+            draw_dots(axes, one.ours.time_s, values[:, k], bars[:, k], _COLOURS[name])
         errors[-1].set_xlabel("time (s)")
     grid[1, 0].set_ylabel("range error (%)")
     grid[2, 0].set_ylabel("yaw error (degrees)")
@@ -228,7 +207,6 @@ def _draw(figure: Figure, seen: Mapping[str, MeasuredScene]) -> None:
 
 
 EXPERIMENT = Experiment(
-    name="failures",
     title="Growth and sunlight",
     paper="section 5.5, figure 24",
     about="The same course along a clear net, a net with growth on most of it in turbid water, and "

@@ -50,11 +50,9 @@ _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 class RenderedDive:
     """Rendered dive on disk."""
 
-    name: str
     # With `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the requested frames.
     folder: Path
     rig: Rig  # True rig.
-
     scenario: Scenario
 
     @property
@@ -104,6 +102,11 @@ class MeasuredDive:
         rows = [nothing if p is None else np.diag(p.covariance) for p in self.postures]
         return np.asarray(np.sqrt(np.array(rows).reshape(-1, 3)))
 
+    @property
+    def valid_percent(self) -> float:
+        """Share of the frames that have a posture."""
+        return 100.0 * float(np.mean(self.valid))
+
     def columns(self, k: int) -> dict[str, FloatArray]:
         """Return truth, value and sigma of range (0), pitch (1) or yaw (2) as columns."""
         name, scale = (("range_m", 1.0), ("pitch_deg", _DEG), ("yaw_deg", _DEG))[k]
@@ -112,18 +115,28 @@ class MeasuredDive:
 
     @property
     def errors(self) -> FloatArray:
-        """`values` less `truth`, shape (N, 3)."""
-        return self.values - self.truth
+        """Errors, shape (N, 3): range in percent of the true one, pitch and yaw in degrees."""
+        return self._in_units(self.values - self.truth)
 
     @property
-    def range_percent(self) -> FloatArray:
-        """Error of the range in percent of the true range, shape (N,)."""
-        return np.asarray(100.0 * self.errors[:, 0] / self.truth[:, 0])
+    def error_sigmas(self) -> FloatArray:
+        """`sigmas` in the units of `errors`, shape (N, 3)."""
+        return self._in_units(self.sigmas)
 
     @property
-    def errors_in_units(self) -> FloatArray:
-        """Errors, shape (N, 3): range in percent, pitch and yaw in degrees."""
-        return np.column_stack([self.range_percent, np.degrees(self.errors[:, 1:])])
+    def largest(self) -> FloatArray:
+        """Largest magnitudes of the errors, shape (3,)."""
+        return np.asarray(np.nanmax(np.abs(self.errors), axis=0))
+
+    @property
+    def rms(self) -> FloatArray:
+        """Root mean square of the errors, shape (3,); NaN if no frame has a posture."""
+        found = self.errors[np.isfinite(self.errors[:, 0])]
+        return np.asarray(np.sqrt(np.mean(found**2, axis=0))) if len(found) else np.full(3, np.nan)
+
+    def _in_units(self, table: FloatArray) -> FloatArray:
+        percent = 100.0 * table[:, 0] / self.truth[:, 0]
+        return np.column_stack([percent, np.degrees(table[:, 1:])])
 
 
 class Laboratory:
@@ -186,7 +199,7 @@ class Laboratory:
             )
             save_rig(rig, folder / _RIG)
             (folder / _READY).write_text(json.dumps(facts, default=str), encoding="utf-8")
-        return RenderedDive(folder.name, folder, rig, scenario)
+        return RenderedDive(folder, rig, scenario)
 
     def measure(
         self, dive: RenderedDive, options: ScannerOptions | None = None, *, rig: Rig | None = None
@@ -197,7 +210,7 @@ class Laboratory:
         """
         assumed = rig or dive.rig
         options = options or ScannerOptions()
-        key = (dive.name, _digest([repr(options), rig_to_mapping(assumed)]))
+        key = (dive.folder.name, _digest([repr(options), rig_to_mapping(assumed)]))
         if key not in self._measured:
             frame_s = self.frame_s if options == ScannerOptions() else []
             self._measured[key] = _measured(dive, Scanner(assumed, options), frame_s)
@@ -237,27 +250,11 @@ QUANTITIES = ("range (%)", "pitch (degrees)", "yaw (degrees)")
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """Measurements by one method, of one dive or several."""
+    """Measurements of a dive by one method."""
 
     name: str
-    measured: tuple[MeasuredDive, ...]
+    measured: MeasuredDive
     ours: bool = False  # Whether this is the default of `aqualvs`.
-
-    @property
-    def valid_percent(self) -> float:
-        """Share of the frames that have a posture."""
-        return 100.0 * float(np.mean(np.concatenate([m.valid for m in self.measured])))
-
-    @property
-    def errors(self) -> FloatArray:
-        """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
-        return np.concatenate([m.errors_in_units for m in self.measured])
-
-    @property
-    def rms(self) -> FloatArray:
-        """Root mean square of the errors, shape (3,); NaN if no frame has a posture."""
-        found = self.errors[np.isfinite(self.errors[:, 0])]
-        return np.asarray(np.sqrt(np.mean(found**2, axis=0))) if len(found) else np.full(3, np.nan)
 
 
 def numbers_text(values: Sequence[float] | FloatArray) -> str:
@@ -272,8 +269,8 @@ def variants_picture(name: str, caption: str, variants: Sequence[Variant]) -> Ex
 
 
 def _draw_variants(figure: Figure, variants: Sequence[Variant]) -> None:
-    rms = np.array([one.rms for one in variants])
-    valid = np.array([one.valid_percent for one in variants])
+    rms = np.array([one.measured.rms for one in variants])
+    valid = np.array([one.measured.valid_percent for one in variants])
     least = 1e-3
     panels = figure.subplots(1, 4, sharey=True)
     for k, axes in enumerate(panels[:3]):
@@ -301,15 +298,15 @@ def compared(
 
     `name` and `caption` are those of the figure; the other parameters are as in `ExperimentResult`.
     """
-    rms = np.array([one.rms for one in variants])
+    rms = np.array([one.measured.rms for one in variants])
     columns: dict[str, FloatArray | list[str]] = {"variant": [one.name for one in variants]}
     for k, what in enumerate(("rms_range_percent", "rms_pitch_deg", "rms_yaw_deg")):
         columns[what] = rms[:, k]
-    columns["valid_percent"] = np.array([one.valid_percent for one in variants])
+    columns["valid_percent"] = np.array([one.measured.valid_percent for one in variants])
     rows = (
         ExperimentRow(
             what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
-            ours=f"{numbers_text(one.rms)}; {one.valid_percent:.0f} %",
+            ours=f"{numbers_text(one.measured.rms)}; {one.measured.valid_percent:.0f} %",
         )
         for one in variants
     )

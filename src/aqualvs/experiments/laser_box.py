@@ -321,7 +321,6 @@ def _draw_band(axes: Axes, ranges: FloatArray, table: FloatArray, colour: str, n
 
 
 EXPERIMENT = Experiment(
-    name="box",
     title="Calibrating the lasers in a box",
     paper="section 3.3, figure 7",
     about="An open box with markers on four planes, the vehicle in front of it: the markers give "

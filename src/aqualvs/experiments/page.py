@@ -84,21 +84,23 @@ class Record:
     failure: str = ""  # Error of a failed experiment; empty if it succeeded.
 
 
-def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path) -> Record:
-    """Write the figures and series of an outcome and return its record.
+def save_outcome(
+    name: str, experiment: Experiment, outcome: ExperimentResult, folder: Path
+) -> Record:
+    """Write the figures and series of an experiment's outcome and return its record.
 
     Raises `OutputError` if something cannot be written. Raises `ValueError` if the columns of a
     series differ in length.
     """
     return Record(
-        name=experiment.name,
+        name=name,
         title=experiment.title,
         paper=experiment.paper,
         about=experiment.about,
         sentence=outcome.sentence,
         findings=outcome.findings,
-        pictures=tuple(_save_picture(experiment.name, one, folder) for one in outcome.pictures),
-        series=tuple(_save_series(experiment.name, one, folder) for one in outcome.series),
+        pictures=tuple(_save_picture(name, one, folder) for one in outcome.pictures),
+        series=tuple(_save_series(name, one, folder) for one in outcome.series),
         notes=outcome.notes,
     )
 
@@ -230,17 +232,16 @@ _LARGEST_SVG = 250_000
 _PX_PER_INCH = 125
 
 
-def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> Path:
+def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> None:
     """Write the page from records, in their order, and from the figures in the folder.
 
-    `seconds`: durations of experiments, as far as known. Returns the path of the page. Raises
-    `OutputError` if a figure cannot be read or the page cannot be written.
+    `seconds`: durations of experiments, as far as known. Raises `OutputError` if a figure cannot be
+    read or the page cannot be written.
     """
     path = folder / PAGE
     with writing(path):
         text = page_html(records, seconds, folder)
         path.write_text(text, encoding="utf-8", errors="replace")
-    return path
 
 
 def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> str:

@@ -244,7 +244,6 @@ def _draw_section(axes: Axes, rig: Rig, traced: Bending) -> None:
 
 
 EXPERIMENT = Experiment(
-    name="rig",
     title="The rig",
     paper="table 1, figures 1 and 2",
     about="The simulated rig of all experiments, unless stated otherwise: camera, dome and lasers "

@@ -124,7 +124,6 @@ def _series(name: str, log: LoopLog) -> DataColumns:
 
 
 CONTROL = Experiment(
-    name="control",
     title="Distance and yaw under control",
     paper="section 5.5, figure 23",
     about="The vehicle holds 0.6 m and stays square to a net in a current of 0.3 m/s and waves, "
@@ -325,7 +324,6 @@ def _draw(figure: Figure, log: LoopLog, seen_s: FloatArray, measured: FloatArray
 
 
 SEA = Experiment(
-    name="sea",
     title="Down along a net at sea",
     paper="section 5.5, figure 22",
     about="The vehicle sinks along the net of a cage in current and waves, keeping its distance; "

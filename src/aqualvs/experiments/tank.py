@@ -61,7 +61,7 @@ def swing(name: str) -> Scenario:
 def _run_angles(laboratory: Laboratory) -> ExperimentResult:
     rig = calibrated_rig(laboratory)
     seen = {name: laboratory.measure(laboratory.dive(swing(name)), rig=rig) for name in _ANGLES}
-    worst = {name: _largest_deg(seen[name], name) for name in _ANGLES}
+    worst = {name: seen[name].largest[column] for name, (column, _) in _ANGLES.items()}
     return ExperimentResult(
         sentence=f"Through swings of {_SWING.amplitude_deg:g} degrees to either side pitch stays "
         f"within {worst['pitch']:.2f} and yaw within {worst['yaw']:.2f} degrees of the truth; the "
@@ -95,7 +95,8 @@ def _run_angles(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _findings(name: str, measured: MeasuredDive) -> list[ExperimentRow]:
-    worst = _largest_deg(measured, name)
+    column = _ANGLES[name][0]
+    worst, errors = float(measured.largest[column]), measured.errors[:, column]
     valid = bool(measured.valid.all())
     return [
         ExperimentRow.at_most(
@@ -108,17 +109,9 @@ def _findings(name: str, measured: MeasuredDive) -> list[ExperimentRow]:
         ),
         ExperimentRow(
             what=f"{name}: root mean square error (degrees)",
-            ours=f"{np.sqrt(np.nanmean(_errors_deg(measured, name) ** 2)):.3f}",
+            ours=f"{np.sqrt(np.nanmean(errors**2)):.3f}",
         ),
     ]
-
-
-def _errors_deg(measured: MeasuredDive, name: str) -> FloatArray:
-    return np.asarray(np.degrees(measured.errors[:, _ANGLES[name][0]]))
-
-
-def _largest_deg(measured: MeasuredDive, name: str) -> float:
-    return float(np.nanmax(np.abs(_errors_deg(measured, name))))
 
 
 def _draw_angle(figure: Figure, measured: MeasuredDive, name: str) -> None:
@@ -130,15 +123,14 @@ def _draw_angle(figure: Figure, measured: MeasuredDive, name: str) -> None:
     top.set_ylabel(f"{name} (degrees)")
     top.legend(("truth", "measured"), loc="upper right")
     low.axhline(0.0, color=GREY, linewidth=0.7)
-    bars = 2.0 * np.degrees(measured.sigmas[:, column])
-    draw_dots(low, measured.time_s, _errors_deg(measured, name), bars, OURS)
+    bars = 2.0 * measured.error_sigmas[:, column]
+    draw_dots(low, measured.time_s, measured.errors[:, column], bars, OURS)
     bar = _SWING.bar_deg
     low.set(ylim=(-bar, bar), ylabel="error (degrees)", xlabel="time (s)")
     figure.align_ylabels((top, low))
 
 
 ANGLES = Experiment(
-    name="angles",
     title="Pitch and yaw to a wall",
     paper="section 5.3, figures 16 and 17",
     about="At 600 mm in front of a wall first the pitch, then the yaw swings to either side. The "
@@ -185,10 +177,10 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
     dive = wall_dive(laboratory)
     calibrated = laboratory.measure(dive, rig=calibrated_rig(laboratory))
     true = laboratory.measure(dive)
-    worst, worst_true = _largest(calibrated), _largest(true)
+    worst, worst_true = float(calibrated.largest[0]), float(true.largest[0])
     valid = bool(calibrated.valid.all())
     place = np.round(1e3 * calibrated.truth[:, 0])
-    spread = max(np.nanstd(calibrated.range_percent[place == p]) for p in np.unique(place))
+    spread = max(np.nanstd(calibrated.errors[place == p, 0]) for p in np.unique(place))
     columns = {**calibrated.columns(0), "range_true_rig_m": true.values[:, 0]}
     *most, farthest = PLACES_MM
     return ExperimentResult(
@@ -233,17 +225,13 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
     )
 
 
-def _largest(measured: MeasuredDive) -> float:
-    return float(np.nanmax(np.abs(measured.range_percent)))
-
-
 def _draw_distance(figure: Figure, calibrated: MeasuredDive, true: MeasuredDive) -> None:
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
     left.axhspan(
         -_DISTANCES.paper_percent, _DISTANCES.paper_percent, color=PAPER, alpha=0.15, linewidth=0
     )
     left.text(370, 1.95, f"paper: within {_DISTANCES.paper_percent} %", color=PAPER, va="top")
-    left.plot(1e3 * calibrated.truth[:, 0], calibrated.range_percent, ".", color=OURS)
+    left.plot(1e3 * calibrated.truth[:, 0], calibrated.errors[:, 0], ".", color=OURS)
     left.set_ylim(-2.6, 2.6)
     left.set_title("at the paper's scale", loc="left")
     _dots(right, true, GREY, "true rig", -4.0)
@@ -259,8 +247,8 @@ def _draw_distance(figure: Figure, calibrated: MeasuredDive, true: MeasuredDive)
 def _dots(axes: Axes, measured: MeasuredDive, colour: str, label: str, aside_mm: float) -> None:
     """Draw the frames at a distance side by side, so that they can be distinguished."""
     at = 1e3 * measured.truth[:, 0] + aside_mm + _fanned(measured.truth[:, 0])
-    bars = 200.0 * measured.sigmas[:, 0] / measured.truth[:, 0]
-    draw_dots(axes, at, measured.range_percent, bars, colour, bar_width=0.5, label=label)
+    errors, bars = measured.errors[:, 0], 2.0 * measured.error_sigmas[:, 0]
+    draw_dots(axes, at, errors, bars, colour, bar_width=0.5, label=label)
 
 
 def _fanned(truth: FloatArray) -> FloatArray:
@@ -274,7 +262,6 @@ def _fanned(truth: FloatArray) -> FloatArray:
 
 
 DISTANCE = Experiment(
-    name="distance",
     title="Distance to a wall",
     paper="section 5.3, figure 15",
     about="The vehicle stands square to the wall of a tank, at four distances. A rig calibrated "

@@ -347,7 +347,6 @@ def _series(numbers: IndexSeries, spread: Decentred) -> tuple[DataColumns, ...]:
 
 
 EXPERIMENT = Experiment(
-    name="index",
     title="The water's index, fresh to sea",
     paper="section 2.2, figure 5",
     about="A target fixed to the vehicle, in view of the camera, determines the index of the "
