@@ -8,7 +8,7 @@ import numpy as np
 from aqualvs.errors import OptionError
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig
-from aqualvs.simulation.scenario import dome_from_target, random_bubbles, random_fish
+from aqualvs.simulation.scenario import dome_from_target, random_bubble, random_fish
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from aqualvs.simulation.scene import Mesh, Net, Scene, Wall, WaterOptics
 
@@ -56,8 +56,10 @@ def random_scene(rng: np.random.Generator, difficulty: Difficulty = "usual") -> 
         dome_from_scene=pose,
         walls=walls,
         nets=(net,),
-        fish=random_fish(rng, int(rng.integers(0, n_fish + 1)), 0.2, behind),
-        bubbles=random_bubbles(rng, int(rng.integers(0, n_bubbles + 1)), 0.2, behind),
+        fish=tuple(random_fish(rng, 0.2, behind) for _ in range(rng.integers(0, n_fish + 1))),
+        bubbles=tuple(
+            random_bubble(rng, 0.2, behind) for _ in range(rng.integers(0, n_bubbles + 1))
+        ),
         target="net",
         water=_water(rng, difficulty),
     )

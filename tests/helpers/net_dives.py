@@ -16,7 +16,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenario import dome_from_target, random_bubbles, random_fish
+from aqualvs.simulation.scenario import dome_from_target, random_bubble, random_fish
 from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall
 from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import cast
@@ -209,8 +209,8 @@ def _with_company(
         wall if abs(np.tan(wall.yaw)) * reach < wall.depth - _CLEAR else replace(wall, yaw=0.0)
         for wall in scene.walls
     )
-    fish = random_fish(rng, len(scene.fish), seconds, behind)
-    bubbles = random_bubbles(rng, len(scene.bubbles), seconds, behind)
+    fish = [random_fish(rng, seconds, behind) for _ in scene.fish]
+    bubbles = [random_bubble(rng, seconds, behind) for _ in scene.bubbles]
 
     def along(own: tuple[float, float, float]) -> tuple[float, float, float]:
         return (own[0] + float(velocity[0]), own[1], own[2] + float(velocity[1]))

@@ -18,7 +18,7 @@ from aqualvs.simulation.cameras import (
     simulated_camera,
     spread,
 )
-from aqualvs.simulation.lasers import ColourFilters, band_shares, laser_wavelength_nm
+from aqualvs.simulation.lasers import ColourFilters, band_shares, default_sources
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import CameraSensor, Scene, WaterOptics
@@ -224,8 +224,9 @@ def test_lamps_light_the_scene():
 
 @pytest.mark.parametrize(("stated", "taken"), [(None, GREEN_NM), (650.0, 650.0)])
 def test_a_laser_may_tell_its_wavelength(stated, taken):
-    laser = replace(example_rig().lasers[0], wavelength_nm=stated)
-    assert laser_wavelength_nm(laser) == taken
+    rig = example_rig()
+    lasers = (replace(rig.lasers[0], wavelength_nm=stated),)
+    assert default_sources(replace(rig, lasers=lasers))[0].wavelength_nm == taken
 
 
 def test_water_dims_a_wavelength_as_its_band():

@@ -16,9 +16,10 @@ from aqualvs.control.tune import Tuned, TuneOptions, shaping_of_model, tune
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
 from aqualvs.results.files import Claim
 from aqualvs.simulation.vehicle.models import VEHICLES, VehicleModel
-from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle, level_pose
+from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 from aqualvs.simulation.vehicle.water_motion import WaterMotion
 from aqualvs.terminal import Echo
 
@@ -62,7 +63,7 @@ def simulate_step(
     """
     options = options or StepOptions()
     ahead = _WALL - options.begin - model.dome_position[0]
-    pose = level_pose(np.array([ahead, 0.0, _DEPTH]), 0.0)
+    pose = SE3(np.eye(3), np.array([ahead, 0.0, _DEPTH]))
     vehicle = SimulatedVehicle(
         model, WaterMotion(), np.random.default_rng(0), pose, latency=options.delay
     )

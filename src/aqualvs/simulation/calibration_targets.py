@@ -106,18 +106,6 @@ def vehicle_in_box(count: int, rng: np.random.Generator) -> list[SE3]:
     return poses
 
 
-def plate_in_view(rig: Rig, size: Size, far: float) -> SE3:
-    """Return `dome_from_plate` of a plate in the quarter of the view farthest from the lasers.
-
-    `rig`: in its water. `size`: width and height of the plate, in metres. `far`: distance of its
-    middle from the dome's outside, in metres.
-    """
-    turn = rotation_from_rotvec(np.deg2rad([3.0, 1.0, 6.0])) @ DOME_FROM_CAM_NOMINAL
-    rays = rig.camera().rays(np.array(_QUARTERS) * rig.size_px - 0.5)
-    poses = [_centred(turn, middle, size) for middle in rays.points_at(np.full(4, far))]
-    return max(poses, key=lambda pose: _clearance(rig, pose, size))
-
-
 def _clearance(rig: Rig, pose: SE3, size: Size) -> float:
     """Return the distance of a rectangle from all sheets, in metres; negative if one crosses it."""
     corners = pose.apply(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) * [*size, 0.0])
@@ -239,22 +227,23 @@ def _places(cells: int, side: int) -> IntArray:
     return first + pitch * np.arange(count)
 
 
-def marker_plate() -> Marked:
-    """Return a plate of six markers, in a frame of its own."""
+def plate_before(rig: Rig, far: float) -> Marked:
+    """Return a plate of six markers, fixed in the quarter of the view farthest from the lasers.
+
+    `rig`: in its water. `far`: distance of the plate's middle from the dome's outside, in metres.
+    """
     # In cells, whose side is in metres.
     side, gap, cell = 24, 6, 1e-3
     places = grid_corners(*(gap + (side + gap) * np.arange(n) for n in (3, 2)))
     first_on_plate = 300
     prints = _prints(first_on_plate, places, side, 0)
     paper = np.full((2 * side + 3 * gap, 3 * side + 4 * gap), PAPER)
-    panel = Panel(SE3.identity(), marker_texture(paper, cell, prints))
-    return Marked("plate", panel, prints)
-
-
-def plate_before(rig: Rig, far: float) -> Marked:
-    """Return the plate as it is fixed before a rig, see `plate_in_view`."""
-    plate = marker_plate()
-    return moved(plate, plate_in_view(rig, plate.panel.texture.size, far))
+    texture = marker_texture(paper, cell, prints)
+    turn = rotation_from_rotvec(np.deg2rad([3.0, 1.0, 6.0])) @ DOME_FROM_CAM_NOMINAL
+    rays = rig.camera().rays(np.array(_QUARTERS) * rig.size_px - 0.5)
+    poses = [_centred(turn, middle, texture.size) for middle in rays.points_at(np.full(4, far))]
+    pose = max(poses, key=lambda pose: _clearance(rig, pose, texture.size))
+    return Marked("plate", Panel(pose, texture), prints)
 
 
 def plate_scene(plate: Marked, i: int, light: RoomLight) -> PanelScene:

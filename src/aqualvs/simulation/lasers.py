@@ -42,11 +42,6 @@ LUMA: FloatArray = np.array([0.299, 0.587, 0.114])
 LUMA.flags.writeable = False
 
 
-def laser_wavelength_nm(laser: Laser) -> float:
-    """Return the wavelength of a rig's laser in nanometres; `GREEN_NM` if the rig has none."""
-    return GREEN_NM if laser.wavelength_nm is None else laser.wavelength_nm
-
-
 def band_shares(wavelength_nm: float) -> FloatArray:
     """Return the weights (3,) of the water's red, green and blue bands at a wavelength.
 
@@ -163,7 +158,7 @@ def default_sources(rig: Rig) -> tuple[LaserSource, ...]:
 def _source_on(laser: Laser, rig: Rig) -> LaserSource:
     """Return a source on the plane, near the dome, 10 mm before the dome's centre.
 
-    Behind a window it is the rig's source.
+    Behind a window it is the rig's source. It is green if the rig gives no wavelength.
     """
     normal = laser.plane.normal
     forward = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
@@ -179,9 +174,8 @@ def _source_on(laser: Laser, rig: Rig) -> LaserSource:
     else:
         foot = normal * laser.plane.offset
         position = foot - (foot[1] - 0.01) / forward[1] * forward
-    return LaserSource(
-        position=position, direction=forward, wavelength_nm=laser_wavelength_nm(laser)
-    )
+    wavelength_nm = GREEN_NM if laser.wavelength_nm is None else laser.wavelength_nm
+    return LaserSource(position=position, direction=forward, wavelength_nm=wavelength_nm)
 
 
 def pack_sheets(

@@ -17,14 +17,13 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.transforms import SE3
-from aqualvs.simulation.scene import Box, Bubble, Fish, Fold, Net, Scene, Wall
+from aqualvs.simulation.scene import Box, Fold, Net, Scene, Swimmer, Wall
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 # Pairs of corners that differ in one coordinate.
 _EDGES = np.array([(i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step])
 
-
-Swimmer = TypeVar("Swimmer", Fish, Bubble)
+AnySwimmer = TypeVar("AnySwimmer", bound=Swimmer)
 
 
 class NetPosture(NamedTuple):
@@ -257,7 +256,7 @@ def _turned_wall(wall: Wall, patch_from_net: SE3) -> Wall:
     return replace(wall, depth=depth, yaw=math.atan2(x, y), pitch=math.atan2(z, y))
 
 
-def _moved(one: Swimmer, patch_from_net: SE3) -> Swimmer:
+def _moved(one: AnySwimmer, patch_from_net: SE3) -> AnySwimmer:
     position, velocity = patch_from_net.apply(one.position), patch_from_net.rotate(one.velocity)
     return replace(one, position=_vec(position), velocity=_vec(velocity))
 

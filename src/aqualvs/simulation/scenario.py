@@ -7,7 +7,7 @@ at random such that the camera meets them. A scenario file is short YAML with th
 
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -28,6 +28,7 @@ from aqualvs.simulation.scene import (
     Mesh,
     Net,
     Scene,
+    SceneContent,
     Target,
     Wall,
     WaterOptics,
@@ -39,18 +40,12 @@ _IN_FRONT = 0.10
 _SIDE, _HEIGHT = 0.20, 0.13
 
 
-def random_fish(
-    rng: np.random.Generator, count: int, duration: float, behind: float
-) -> tuple[Fish, ...]:
-    """Return fish that cross the view at some time of the dive.
+def random_fish(rng: np.random.Generator, duration: float, behind: float) -> Fish:
+    """Return a fish that crosses the view at some time of the dive.
 
     `duration`: of the dive, in seconds. `behind`: free room behind the target plane, in metres, for
     example before a wall.
     """
-    return tuple(_fish(rng, duration, behind) for _ in range(count))
-
-
-def _fish(rng: np.random.Generator, duration: float, behind: float) -> Fish:
     length = float(rng.uniform(0.12, 0.34))
     depth = float(rng.uniform(-_IN_FRONT, max(behind - 0.3 * length, -0.05)))
     side = float(rng.choice([-1.0, 1.0]))
@@ -65,14 +60,8 @@ def _fish(rng: np.random.Generator, duration: float, behind: float) -> Fish:
     )
 
 
-def random_bubbles(
-    rng: np.random.Generator, count: int, duration: float, behind: float
-) -> tuple[Bubble, ...]:
-    """Return bubbles that rise through the view at some time of the dive; see `random_fish`."""
-    return tuple(_bubble(rng, duration, behind) for _ in range(count))
-
-
-def _bubble(rng: np.random.Generator, duration: float, behind: float) -> Bubble:
+def random_bubble(rng: np.random.Generator, duration: float, behind: float) -> Bubble:
+    """Return a bubble that rises through the view at some time of the dive; see `random_fish`."""
     rise, when = float(rng.uniform(0.10, 0.25)), float(rng.uniform(0.0, duration))
     place = (
         float(rng.uniform(-_SIDE, _SIDE)),
@@ -176,24 +165,14 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scenario:
-    """Scenario of a dive: scene and motion, before rendering."""
+class Scenario(SceneContent):
+    """Scenario of a dive, before rendering: a scene, which moves with the target, and motion."""
 
     name: str  # Name in reports.
     duration: float  # In seconds.
     fps: float = 25.0  # Frames a second.
     seed: int = 0  # Seed of noise and everything else that is random.
     trajectory: Trajectory = field(default_factory=Trajectory)  # Posture of the vehicle over time.
-    target: Target = "none"  # Content of the target plane; "none" if it is empty.
-    # As in `Scene`; they move with the target.
-    walls: tuple[Wall, ...] = ()
-    nets: tuple[Net, ...] = ()
-    fish: tuple[Fish, ...] = ()
-    bubbles: tuple[Bubble, ...] = ()
-    boxes: tuple[Box, ...] = ()
-    water: WaterOptics = field(default_factory=WaterOptics)
-    sensor: CameraSensor = field(default_factory=CameraSensor)
-    lasers_on: bool = True
     shutter: str | None = None  # Of the camera, in the words of `--shutter`; None leaves the rig's.
 
     @property
@@ -207,18 +186,8 @@ class Scenario:
 
     def scene_at(self, t: float) -> Scene:
         """Return the scene before the vehicle at time `t`; render it at the same `t`."""
-        return Scene(
-            dome_from_scene=self.trajectory.pose_at(t, self.duration),
-            walls=self.walls,
-            nets=self.nets,
-            fish=self.fish,
-            bubbles=self.bubbles,
-            boxes=self.boxes,
-            target=self.target,
-            water=self.water,
-            sensor=self.sensor,
-            lasers_on=self.lasers_on,
-        )
+        content = {part.name: getattr(self, part.name) for part in fields(SceneContent)}
+        return Scene(dome_from_scene=self.trajectory.pose_at(t, self.duration), **content)
 
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -353,8 +322,8 @@ class ScenarioFile(_Part):
             target=_target(self),
             walls=walls,
             nets=(_net(self.net, self.seed),) if self.net else (),
-            fish=random_fish(rng, self.fish, self.duration_s, behind),
-            bubbles=random_bubbles(rng, self.bubbles, self.duration_s, behind),
+            fish=tuple(random_fish(rng, self.duration_s, behind) for _ in range(self.fish)),
+            bubbles=tuple(random_bubble(rng, self.duration_s, behind) for _ in range(self.bubbles)),
             boxes=tuple(Box(**si_values(box)) for box in self.boxes),
             water=_water(self.water),
             sensor=CameraSensor(**self.sensor.model_dump()),

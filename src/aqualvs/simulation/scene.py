@@ -8,7 +8,7 @@ Colours are (red, green, blue). Radiance 1 is the sensor's full scale at gain 1.
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Literal, TypeAlias
+from typing import Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -102,33 +102,35 @@ class Net:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fish:
-    """Fish: an ellipsoid with tail and eye that swims straight on and beats its tail."""
+class Swimmer:
+    """Body that moves straight on."""
 
     # In `scene`, in metres and m/s, at time 0.
     position: Vector
+    velocity: Vector
+
+    def at(self, t: float) -> Self:
+        """Return the body `t` seconds later."""
+        x, y, z = (p + v * t for p, v in zip(self.position, self.velocity, strict=True))
+        return replace(self, position=(x, y, z))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fish(Swimmer):
+    """Fish: an ellipsoid with tail and eye that swims straight on and beats its tail."""
+
     velocity: Vector = (0.15, 0.0, 0.0)
     length: float = 0.25  # Length of the body in metres; height and thickness follow.
     albedo: Vector = (0.40, 0.43, 0.42)  # Diffuse reflectance of the flank.
     beat: float = 1.5  # Beats of the tail a second.
 
-    def at(self, t: float) -> "Fish":
-        """Return the fish `t` seconds later."""
-        return replace(self, position=_moved(self.position, self.velocity, t))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Bubble:
+class Bubble(Swimmer):
     """Bubble with a bright rim, a clear middle and glints of sun and lasers."""
 
-    # In `scene`, in metres and m/s, at time 0.
-    position: Vector
     velocity: Vector = (0.0, 0.0, 0.2)
     radius: float = 0.004  # In metres.
-
-    def at(self, t: float) -> "Bubble":
-        """Return the bubble `t` seconds later."""
-        return replace(self, position=_moved(self.position, self.velocity, t))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,11 +175,10 @@ class CameraSensor:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
-    """Scene in front of the camera at one instant; moving bodies have their velocity."""
+class SceneContent:
+    """Content of a scene, wherever it is: surfaces, water, sensor."""
 
-    dome_from_scene: SE3  # Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
-    # Surfaces.
+    # Surfaces; moving bodies have their velocity.
     walls: tuple[Wall, ...] = ()
     nets: tuple[Net, ...] = ()
     fish: tuple[Fish, ...] = ()
@@ -188,6 +189,13 @@ class Scene:
     # Optical and electronic properties of the camera.
     sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True  # False switches all lasers off.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene(SceneContent):
+    """Scene in front of the camera at one instant."""
+
+    dome_from_scene: SE3  # Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
 
     def target_plane(self) -> Plane:
         """Return the target plane in `dome`, its normal away from the vehicle."""
@@ -200,8 +208,3 @@ def target_axes(pitch: float, yaw: float) -> FloatArray:
     """Return axes (columns) of a plane whose far normal points right by yaw and up by pitch."""
     normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
     return upright_axes(normal / np.linalg.norm(normal))
-
-
-def _moved(position: Vector, velocity: Vector, t: float) -> Vector:
-    x, y, z = (p + v * t for p, v in zip(position, velocity, strict=True))
-    return x, y, z

@@ -25,7 +25,7 @@ from aqualvs.simulation.lasers import (
     fan_rays,
     pack_sheets,
 )
-from aqualvs.simulation.scene import Scene, SurfaceKind, Target
+from aqualvs.simulation.scene import Scene, SurfaceKind
 from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
 
 
@@ -164,13 +164,6 @@ _ON_WALL = 1e-6
 # Each step divides what is left by the radius over the range; nets bend less than 1 / m.
 _STEPS_TO_NEAREST = 40
 
-LABELS: dict[Target, SurfaceKind] = {
-    "net": SurfaceKind.NET,
-    "wall": SurfaceKind.WALL,
-    "none": SurfaceKind.NONE,
-}
-"""Kind of surface that a scene's target is."""
-
 
 def truth_row(frame: int, t: float, scene: Scene, rig: Rig, lit: LitPoints) -> list[Cell]:
     """Return the cells of one frame, in the order of `TRUTH_COLUMNS`."""
@@ -223,7 +216,7 @@ def target_fit(scene: Scene, lit: LitPoints) -> tuple[Plane, float] | None:
     nearest to the dome's centre, moved to where the lit points are; else the plane through the lit
     points, without those on other walls.
     """
-    lit_points: FloatArray = lit.points_in_dome[lit.label == LABELS[scene.target]]
+    lit_points: FloatArray = lit.points_in_dome[lit.label == SurfaceKind[scene.target.upper()]]
     if scene.target == "wall":
         off = scene.target_plane().signed_distance(lit_points)
         lit_points = lit_points[np.abs(off) < _ON_WALL]

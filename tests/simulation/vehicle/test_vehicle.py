@@ -9,6 +9,7 @@ import pytest
 from aqualvs.control.tune import facts_of, shaping_of_model
 from aqualvs.control.vehicle import Effort
 from aqualvs.errors import OptionError
+from aqualvs.geometry.transforms import SE3
 from aqualvs.simulation.vehicle.dynamics import mix_inputs, pack_pilot, thrust_of
 from aqualvs.simulation.vehicle.models import (
     BLUEROV2,
@@ -19,7 +20,7 @@ from aqualvs.simulation.vehicle.models import (
     ThrustCurve,
     VehicleModel,
 )
-from aqualvs.simulation.vehicle.vehicle import SensorErrors, Sensors, SimulatedVehicle, level_pose
+from aqualvs.simulation.vehicle.vehicle import SensorErrors, Sensors, SimulatedVehicle
 from aqualvs.simulation.vehicle.water_motion import WaterMotion, Waves
 
 MODELS = pytest.mark.parametrize("model", VEHICLES.values(), ids=VEHICLES)
@@ -30,7 +31,7 @@ FRAME = 0.04
 def vehicle(
     model: VehicleModel, *, heading: float = 0.0, water: WaterMotion | None = None, **options: float
 ) -> SimulatedVehicle:
-    pose = level_pose(np.array([0.0, 0.0, 6.0]), heading)
+    pose = SE3.from_rotvec([0.0, 0.0, heading], [0.0, 0.0, 6.0])
     rng = np.random.default_rng(1)
     return SimulatedVehicle(model, water or WaterMotion(), rng, pose, **options)
 
@@ -253,7 +254,7 @@ def test_sensors_are_as_wrong_as_stated() -> None:
         tilt=SensorErrors(),
     )
     rng = np.random.default_rng(7)
-    pose = level_pose(np.array([0.0, 0.0, 6.0]), 0.3)
+    pose = SE3.from_rotvec([0.0, 0.0, 0.3], [0.0, 0.0, 6.0])
     one = SimulatedVehicle(BLUEROV2_HEAVY, WaterMotion(), rng, pose, sensors=kinds)
     depth, heading, tilt = [], [], []
     for _ in range(2000):

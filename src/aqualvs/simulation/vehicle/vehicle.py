@@ -124,17 +124,6 @@ class StickPositions(Protocol):
         """Clockwise from above."""
 
 
-def level_pose(position: FloatArray, heading: float) -> SE3:
-    """Return world_from_body of a level vehicle.
-
-    `position`, shape (3,): north, east, down, in metres. `heading`: clockwise from north, in
-    radians.
-    """
-    c, s = math.cos(heading), math.sin(heading)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return SE3(turn, np.array(position, dtype=np.float64))
-
-
 class SimulatedVehicle:
     """Simulated vehicle under a pilot's sticks.
 
