@@ -38,16 +38,13 @@ class SimulatedLink:
     def state(self) -> VehicleState:
         """Return the vehicle's reported state, by the vehicle's clock."""
         report_hz = 10.0  # Rate at which a vehicle reports its attitude.
-        report = self.vehicle.telemetry()
+        vehicle = self.vehicle
         return VehicleState(
-            heard_s=math.floor(report.time_s * report_hz) / report_hz,
-            armed=report.armed,
-            mode=Mode.OURS if report.obeys else Mode.PILOT,
-            mode_name="ALT_HOLD" if report.obeys else "MANUAL",
-            depth=report.depth,
-            heading=report.heading,
-            roll=report.roll,
-            pitch=report.pitch,
+            heard_s=math.floor(vehicle.time_s * report_hz) / report_hz,
+            armed=vehicle.armed,
+            mode=Mode.OURS if vehicle.obeys else Mode.PILOT,
+            mode_name="ALT_HOLD" if vehicle.obeys else "MANUAL",
+            **vehicle.telemetry()._asdict(),
         )
 
     def send(self, effort: Effort) -> None:

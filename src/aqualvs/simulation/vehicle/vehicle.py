@@ -7,7 +7,7 @@ limited rate (`Sensors`, `Telemetry`).
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -60,14 +60,9 @@ class Sensors:
     tilt: SensorErrors = field(default_factory=lambda: SensorErrors(noise=math.radians(0.2)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Telemetry:
-    """Telemetry of the vehicle, as MAVLink would carry it."""
+class Telemetry(NamedTuple):
+    """Readings of the vehicle's sensors, as MAVLink would carry them."""
 
-    time_s: float  # Time of the reading, in the vehicle's time.
-    armed: bool
-    obeys: bool  # Whether its mode accepts stick positions.
-    lapsed: bool  # Whether it holds still because no stick positions have come for a time.
     depth: float  # Metres, down positive.
     # Radians; heading clockwise from north, -pi to pi.
     heading: float
@@ -253,7 +248,7 @@ class SimulatedVehicle:
         self._take_what_has_come()
 
     def telemetry(self) -> Telemetry:
-        """Return the present telemetry."""
+        """Return the present readings of the sensors."""
         r = self.pose.rotation
         truth = (
             float(self._state[POSITION + 2]),
@@ -265,16 +260,7 @@ class SimulatedVehicle:
             reading.of(value, self._time)
             for reading, value in zip(self._readings, truth, strict=True)
         )
-        return Telemetry(
-            time_s=self._time,
-            armed=self.armed,
-            obeys=self.obeys,
-            lapsed=self.lapsed,
-            depth=depth,
-            heading=math.remainder(heading, 2.0 * math.pi),
-            roll=roll,
-            pitch=pitch,
-        )
+        return Telemetry(depth, math.remainder(heading, 2.0 * math.pi), roll, pitch)
 
     def _engage(self) -> None:
         """Hold the present depth and heading."""
