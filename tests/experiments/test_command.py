@@ -51,9 +51,10 @@ def experiment(name, *, met=True, fault=None, columns=None, sentence="Found 1.",
 def run(folder, *names, **faults):
     """Return exit code and lines; `faults` maps names to what goes wrong there."""
     lines = []
-    load = {name: experiment(name, **faults.get(name, {})) for name in names}
-    code = reproduce(names, folder, lines.append, load.__getitem__)
-    return code, lines
+    with pytest.MonkeyPatch.context() as patch:
+        load = {name: experiment(name, **faults.get(name, {})) for name in names}
+        patch.setattr(catalogue, "experiment", load.__getitem__)
+        return reproduce(names, folder, lines.append), lines
 
 
 def named(folder):

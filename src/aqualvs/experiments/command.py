@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -145,9 +144,6 @@ def time_left_text(seconds: float) -> str:
     return f"about {round(seconds / 60.0)} min left"
 
 
-Load: TypeAlias = Callable[[str], Experiment]
-
-
 def print_experiments(echo: Echo) -> None:
     """Print the name, title and section of the paper of every experiment."""
     width = max(map(len, catalogue.MODULES))
@@ -156,9 +152,7 @@ def print_experiments(echo: Echo) -> None:
         echo(f"{name:<{width}}  {found.title} ({found.paper or 'an ablation'})")
 
 
-def reproduce(
-    names: Sequence[str], out: Path, echo: Echo, load: Load = catalogue.experiment
-) -> int:
+def reproduce(names: Sequence[str], out: Path, echo: Echo) -> int:
     """Run experiments, write the page after each of them, and return 0, or 1 if one failed.
 
     `names`: all experiments if empty. Results of other experiments by the same version in the
@@ -174,7 +168,7 @@ def reproduce(
         results = _Records(out)
         for number, name in enumerate(names, 1):
             bar.start(name)
-            results.run(name, load, laboratory)
+            results.run(name, laboratory)
             echo(f"[{number}/{len(names)}] {_line(results.records[name], results.seconds[name])}")
             bar.end()
             write_page(results.in_order(), results.seconds, out)
@@ -197,10 +191,10 @@ class _Records:
         self.folder = folder
         self.records, self.seconds = read_results(folder)
 
-    def run(self, name: str, load: Load, laboratory: Laboratory) -> None:
+    def run(self, name: str, laboratory: Laboratory) -> None:
         """Run one experiment and store its outcome or its failure."""
         started = time.perf_counter()
-        self.records[name] = self._record(name, load, laboratory)
+        self.records[name] = self._record(name, laboratory)
         self.seconds[name] = time.perf_counter() - started
         if laboratory.frame_s:
             self.seconds[FRAME] = statistics.median(laboratory.frame_s)
@@ -209,11 +203,11 @@ class _Records:
     def in_order(self) -> list[Record]:
         return [self.records[name] for name in catalogue.MODULES if name in self.records]
 
-    def _record(self, name: str, load: Load, laboratory: Laboratory) -> Record:
+    def _record(self, name: str, laboratory: Laboratory) -> Record:
         found: Experiment | None = None
         kept = self.folder / FAILURES / f"{name}.txt"
         try:
-            found = load(name)
+            found = catalogue.experiment(name)
             record = save_outcome(name, found, found.run(laboratory), self.folder)
         except OutputError:
             raise
