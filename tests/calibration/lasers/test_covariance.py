@@ -127,13 +127,12 @@ def test_bias_of_stripes_does_not_average_out() -> None:
 
 def test_doubt_knows_its_medium() -> None:
     given = RigUncertainty(("fx", "n_water", "k1"), np.diag([1.0, 1e-6, 0.0]))
-    water = CameraCovariance.of(RIG, given, None, 0.5)
+    water = CameraCovariance.of(RIG, given, None)
     assert water.names == ("fx",)
+    assert water.columns == ("fx", "n_water")
     assert water.sigma_medium == pytest.approx(1e-3)
-    assert water.medium_is_water
-    air = CameraCovariance.of(RIG, given, 1.0003, 2e-5)
-    assert air.sigma_medium == pytest.approx(2e-5)
-    assert not air.medium_is_water
-    np.testing.assert_allclose(air.covariance, np.diag([1.0, 4e-10]))
-    np.testing.assert_allclose(air.with_given()[1], 0.0)
-    np.testing.assert_allclose(water.with_given()[1], [0.0, 1e-6, 0.0])
+    np.testing.assert_array_equal(water.covariance, np.diag([1.0, 1e-6]))
+    air = CameraCovariance.of(RIG, given, 1.0003)
+    assert air.sigma_medium == 0.0
+    assert air.columns == ("fx",)
+    np.testing.assert_array_equal(air.covariance, [[1.0]])

@@ -31,10 +31,9 @@ class LaserOptions:
     # Number of lasers that shine. None for as many as the rig has, or, if it has none, as many as
     # can be distinguished.
     n_lasers: int | None = None
-    # Index of the medium in the pictures; None for the rig's own water.
+    # Exact index of the medium in the pictures; None for the rig's own water, as uncertain as the
+    # rig says.
     n_medium: float | None = None
-    # Its standard deviation; for the rig's own water the rig's uncertainty counts instead.
-    sigma_n_medium: float = 0.0
     # Whether the camera's uncertain numbers are solved too, with their uncertainty as prior; else
     # they are held, and their uncertainty is propagated.
     refine: bool = False
@@ -49,7 +48,7 @@ class LaserOptions:
         """Refuse values that make no sense."""
         if self.n_lasers is not None and self.n_lasers < 1:
             raise OptionError(f"n_lasers is {self.n_lasers}; use 1 or more")
-        check_not_negative("lasers", self, "sigma_n_medium", "stripe_bias_px")
+        check_not_negative("lasers", self, "stripe_bias_px")
 
 
 def calibrate_lasers(
@@ -73,10 +72,9 @@ def calibrate_lasers(
         If refinement is requested and nothing is uncertain.
     """
     options = options or LaserOptions()
-    camera_covariance = CameraCovariance.of(
-        rig, uncertainty or RigUncertainty.none(), options.n_medium, options.sigma_n_medium
-    )
-    if options.refine and not camera_covariance.n_columns:
+    known = uncertainty or RigUncertainty.none()
+    camera_covariance = CameraCovariance.of(rig, known, options.n_medium)
+    if options.refine and not camera_covariance.columns:
         raise OptionError(
             "refinement is asked for, but the rig says of none of its camera's numbers how well "
             "it is known; calibrate the camera and dome first, or leave refinement out"
@@ -169,7 +167,8 @@ def _result_rig(
     found = tuple(sheet.laser(laser) for laser, sheet in zip(lasers, state.sheets, strict=True))
     if camera_covariance is None:
         return replace(rig, lasers=found)
-    n_water = float(state.bundle.media[0]) if camera_covariance.medium_is_water else rig.n_water
+    in_water = camera_covariance.sigma_medium > 0.0
+    n_water = float(state.bundle.media[0]) if in_water else rig.n_water
     return replace(state.bundle.rig, lasers=found, n_water=n_water)
 
 

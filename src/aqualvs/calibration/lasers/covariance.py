@@ -26,21 +26,16 @@ class CameraCovariance:
     """Uncertain numbers of the camera, and uncertainty of the medium's index."""
 
     names: tuple[str, ...]  # Of the rig's numbers, without the medium's index.
-    # Standard deviation of the index of the medium in the pictures; 0 if exact.
+    # Standard deviation of that index, `n_water`; 0 if it is exact.
     sigma_medium: float
-    # True if that medium is the rig's own water, so that both indices are the same number.
-    medium_is_water: bool
     # Prior uncertainty.
     given: RigUncertainty
 
     @classmethod
-    def of(
-        cls, rig: Rig, given: RigUncertainty, n_medium: float | None, sigma_medium: float
-    ) -> "CameraCovariance":
+    def of(cls, rig: Rig, given: RigUncertainty, n_medium: float | None) -> "CameraCovariance":
         """Return the uncertain numbers of a rig before the calibration.
 
-        `n_medium` is the index of the medium in the pictures, None for the rig's own water, and
-        `sigma_medium` its standard deviation, if it is not that water.
+        `n_medium` is the exact index of the medium in the pictures, None for the rig's own water.
         """
         # Earlier knowledge of the lasers is replaced.
         given = given.only([name for name in given.names if ":" not in name])
@@ -48,34 +43,17 @@ class CameraCovariance:
         known = set(parameter_names(rig.camera())) - {"n_water"}
         names = tuple(n for n in given.names if n in known and sigmas[n] > 0.0)
         is_water = n_medium is None and rig.housing is not None
-        if is_water:
-            sigma_medium = sigmas.get("n_water", 0.0)
-        return cls(names, sigma_medium if rig.housing is not None else 0.0, is_water, given)
+        return cls(names, sigmas.get("n_water", 0.0) if is_water else 0.0, given)
 
     @property
-    def n_columns(self) -> int:
-        """Number of uncertain numbers."""
-        return len(self.names) + (self.sigma_medium > 0.0)
+    def columns(self) -> tuple[str, ...]:
+        """Names of all uncertain numbers, in the order of the problem's first columns."""
+        return (*self.names, "n_water") if self.sigma_medium > 0.0 else self.names
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of the uncertain numbers in the order of the problem's first columns."""
-        covariance = np.zeros((self.n_columns, self.n_columns))
-        n = len(self.names)
-        covariance[:n, :n] = self.given.of(self.names)
-        if self.sigma_medium > 0.0 and self.medium_is_water:
-            covariance[:] = self.given.of((*self.names, "n_water"))
-        elif self.sigma_medium > 0.0:
-            covariance[n, n] = self.sigma_medium**2
-        return covariance
-
-    def with_given(self) -> FloatArray:
-        """Return the covariance (C, U) of the uncertain numbers with all given numbers."""
-        names = (*self.names, "n_water") if self.medium_is_water else self.names
-        rows = [self.given.names.index(n) for n in names[: self.n_columns]]
-        crossed = np.zeros((self.n_columns, len(self.given.names)))
-        crossed[: len(rows)] = self.given.covariance[rows]
-        return crossed
+        """Covariance of the uncertain numbers, in the order of `columns`."""
+        return self.given.of(self.columns)
 
 
 def joint_uncertainty(
@@ -107,7 +85,7 @@ def joint_uncertainty(
     information = _data_information(solution, problem, camera_covariance, correlation)
     covariance = _all_covariance(information, problem, camera_covariance, stripe_bias_px, refined)
     # Poses, board poses and bias are marginalised.
-    n, mine = camera_covariance.n_columns, np.arange(N_LASER * problem.n_lasers)
+    n, mine = len(camera_covariance.columns), np.arange(N_LASER * problem.n_lasers)
     mine += problem.laser_columns(0)[0] + n - problem.bundle.n_shared
     kept = np.concatenate([np.arange(n), mine])
     joint = _with_given(covariance[np.ix_(kept, kept)], camera_covariance)
@@ -124,7 +102,7 @@ def _all_covariance(
     refined: bool,
 ) -> FloatArray:
     """Return the covariance of all numbers from the information of the data alone."""
-    n, n_bias = camera_covariance.n_columns, problem.n_lasers * len(problem.surfaces.planes)
+    n, n_bias = len(camera_covariance.columns), problem.n_lasers * len(problem.surfaces.planes)
     bias = np.arange(len(information) - n_bias, len(information))
     bias_prior = np.diag(np.full(n_bias, stripe_bias_px**2))
     if refined:
@@ -214,14 +192,15 @@ def _with_given(covariance: FloatArray, camera_covariance: CameraCovariance) -> 
 
     Numbers outside the solve follow those in it by their prior correlation.
     """
-    n, n_given = camera_covariance.n_columns, len(camera_covariance.given.names)
-    crossed = camera_covariance.with_given()
+    given = camera_covariance.given
+    n, n_given = len(camera_covariance.columns), len(given.names)
+    crossed = given.covariance[[given.names.index(name) for name in camera_covariance.columns]]
     sigma = np.sqrt(np.diag(camera_covariance.covariance))
     # Units have many sizes, and numbers may be dependent.
     size = np.outer(sigma, sigma)
     follow = crossed.T @ (np.linalg.pinv(camera_covariance.covariance / size, rcond=1e-10) / size)
     joint = np.empty((n_given + len(covariance) - n,) * 2)
-    rest = camera_covariance.given.covariance - follow @ crossed
+    rest = given.covariance - follow @ crossed
     joint[:n_given, :n_given] = rest + follow @ covariance[:n, :n] @ follow.T
     joint[:n_given, n_given:] = follow @ covariance[:n, n:]
     joint[n_given:, :n_given] = joint[:n_given, n_given:].T
