@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, board_surface, place_stripes
-from aqualvs.calibration.lasers.views import PlacedView, SpatialPose
+from aqualvs.calibration.lasers.views import PlacedView
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
@@ -154,7 +154,7 @@ def _view(
         View(name, np.arange(x.size), corners, camera.project(pose.apply(corners))[0]),
         stripes,
         found,
-        SpatialPose(found, 0.0, 0.0),
+        found,
         place_stripes(camera, stripes, found, board_surface()),
         0,
         0.1,

@@ -5,13 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.lasers.problem import (
-    N_BOARD_POSE,
-    BoardPosePrior,
-    LaserProblem,
-    LaserState,
-    distances_of,
-)
+from aqualvs.calibration.lasers.problem import N_BOARD_POSE, LaserProblem, LaserState, distances_of
 from aqualvs.calibration.lasers.stripes_on_planes import (
     StripePoints,
     TargetSurfaces,
@@ -49,7 +43,7 @@ def made(
             mine = np.flatnonzero(view.stripes.chain // n == i_laser)
             group = binned(i, i_laser, view.stripes.at(mine), view.stripes.chain[mine] % n)
             groups.append(with_gain(group, camera, planes, sheet))
-    prior = BoardPosePrior(0.01, 0.002) if loose else None
+    prior = np.array([0.01, 0.01, 0.002]) if loose else None
     problem = LaserProblem(bundle, surfaces, tuple(groups), len(sheets), prior)
     return problem, LaserState(state, sheets, np.zeros((2, N_BOARD_POSE)))
 

@@ -176,9 +176,7 @@ def view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFig
     corners = block.residuals * CORNER_SIGMA_PX
     residuals, believed, weights, _ = _stripes(solved, solved.groups_of(view=i_view))
     pose = solved.state.bundle.poses[i_view]
-    angle, shift = pose_difference(
-        pose, view.spatial.dome_from_target, view.view.points.mean(axis=0)
-    )
+    angle, shift = pose_difference(pose, view.spatial, view.view.middle)
     return ViewFigures(
         name=view.view.name,
         dome_from_target=pose,
@@ -431,11 +429,6 @@ def _plane(plane: JudgedPlane, places: Sequence[str]) -> str:
     """Return the number of a plane's points and the pictures it is seen in."""
     rest = f" and {len(plane.patches) - 1} more" if len(plane.patches) > 1 else ""
     return f"{len(plane.candidate.members)} points in {places[plane.patches[0]]}{rest}"
-
-
-def typical_corner_error_px(views: Sequence[PlacedView]) -> float:
-    """Return the corners' residual in each direction after a pose by corners alone, in pixels."""
-    return float(np.median([view.rms_px for view in views]) / np.sqrt(2.0))
 
 
 def contradicts(solved: SolvedLasers) -> bool:

@@ -34,19 +34,6 @@ BOARD_POSES = "board poses"
 
 
 @dataclass(frozen=True, slots=True)
-class BoardPosePrior:
-    """Standard deviations of a board's pose on the surface of the stripes."""
-
-    tilt: float  # Of the angle between them about either axis of the board, in radians.
-    offset: float  # Of the distance at the board's middle, in metres.
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """Standard deviations of a board's pose, shape (3,)."""
-        return np.array([self.tilt, self.tilt, self.offset])
-
-
-@dataclass(frozen=True, slots=True)
 class LaserState:
     """Unknowns of the problem."""
 
@@ -80,8 +67,9 @@ class LaserProblem:
     surfaces: TargetSurfaces  # Of the target.
     groups: tuple[StripeGroup, ...]  # Stripes; their residuals come before the corners'.
     n_lasers: int
-    # Uncertainty of the target's pose on the surface; None if the target is the surface.
-    board_pose_prior: BoardPosePrior | None = None
+    # Shape (3,): standard deviations of a board's pose, as `LaserState.board_poses`; None if the
+    # target is the surface.
+    board_pose_prior: FloatArray | None = None
 
     @property
     def n_parameters(self) -> int:
@@ -112,7 +100,7 @@ class LaserProblem:
         ]
         blocks += self.bundle.blocks(state.bundle)
         if self.board_pose_prior is not None:
-            sigma = self.board_pose_prior.sigmas
+            sigma = self.board_pose_prior
             for i, row in enumerate(state.board_poses):
                 columns, off = self.board_pose_columns(i), (row / sigma)[None]
                 slopes = np.diag(1.0 / sigma)[None]
@@ -141,7 +129,7 @@ class LaserProblem:
         planes = self.surfaces.placed(pose)
         if self.board_pose_prior is None:
             return planes
-        middle = pose.apply(self.bundle.views[i_view].view.points.mean(axis=0))
+        middle = pose.apply(self.bundle.views[i_view].view.middle)
         return [_displaced(plane, self._tangents(pose), middle, board_pose) for plane in planes]
 
     def _tangents(self, pose: SE3) -> FloatArray:
@@ -224,13 +212,12 @@ class LaserProblem:
                 right[:, :2, n_free] = -by_number[..., names.index("n_water")]
         else:
             _, _, by_point = camera.project_with_jacobian(points)
+        middle = pose.apply(view.view.middle)
         if n_pose:
-            middle = pose.apply(view.view.points.mean(axis=0))
             by_pose = point_by_pose(points, middle)
             right[:, 2, n_shared : n_shared + n_pose] = np.einsum("ni,nic->nc", normals, by_pose)
         if n_board_pose:
-            offsets = points - pose.apply(view.view.points.mean(axis=0))
-            right[:, 2, -N_BOARD_POSE:-1] = -offsets @ self._tangents(pose).T
+            right[:, 2, -N_BOARD_POSE:-1] = -(points - middle) @ self._tangents(pose).T
             right[:, 2, -1] = 1.0
         return solve_on_surface(by_point, normals, right)
 

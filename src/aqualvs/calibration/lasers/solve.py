@@ -11,29 +11,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.lasers.checks import (
-    SolvedLasers,
-    contradicts,
-    like,
-    typical_corner_error_px,
-)
+from aqualvs.calibration.lasers.checks import SolvedLasers, contradicts, like
 from aqualvs.calibration.lasers.covariance import CameraCovariance
 from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
-from aqualvs.calibration.lasers.problem import (
-    N_BOARD_POSE,
-    BoardPosePrior,
-    LaserProblem,
-    LaserState,
-)
+from aqualvs.calibration.lasers.problem import N_BOARD_POSE, LaserProblem, LaserState
 from aqualvs.calibration.lasers.stripes_on_planes import (
     TargetSurfaces,
     binned,
     correlation_factor,
+    place_stripes,
     points_on,
     with_gain,
     with_shared_error,
 )
-from aqualvs.calibration.lasers.views import PlacedView, pooled, replaced, split_by_view
+from aqualvs.calibration.lasers.views import PlacedView, pooled, split_by_view
 from aqualvs.calibration.solver.bundle import Bundle, BundleState, TargetView
 from aqualvs.calibration.solver.least_squares import solve
 from aqualvs.geometry.arrays import FloatArray, IntArray
@@ -83,20 +74,16 @@ def choose_sheets(
     if all(laser.window is None for laser in lasers):
         return flat, ["plane"] * len(lasers)
     bent = solve_with(start_sheets(rig, lasers, bent=True))
-    chosen, words = [], []
-    for i, laser in enumerate(lasers):
-        if laser.window is None:
-            chosen.append(flat.state.sheets[i])
-            words.append("plane")
-            continue
-        keep_window, why = _choice(flat, bent, i)
-        chosen.append((bent if keep_window else flat).state.sheets[i])
-        words.append(why)
-    return solve_with(tuple(chosen)), words
+    choices = [
+        (flat, "plane") if laser.window is None else _choice(flat, bent, i)
+        for i, laser in enumerate(lasers)
+    ]
+    sheets = tuple(better.state.sheets[i] for i, (better, _) in enumerate(choices))
+    return solve_with(sheets), [words for _, words in choices]
 
 
-def _choice(flat: SolvedLasers, bent: SolvedLasers, i_laser: int) -> tuple[bool, str]:
-    """Return whether the sheet of a laser is bent, and why."""
+def _choice(flat: SolvedLasers, bent: SolvedLasers, i_laser: int) -> tuple[SolvedLasers, str]:
+    """Return the solution with the better sheet of a laser, and why."""
     (flat_px, n_flat), (bent_px, n_bent) = _fit(flat, i_laser), _fit(bent, i_laser)
     # Both have three unknowns, so that only the residuals count.
     evidence = 2.0 * min(n_flat, n_bent) * float(np.log(max(flat_px, 1e-9) / max(bent_px, 1e-9)))
@@ -105,10 +92,10 @@ def _choice(flat: SolvedLasers, bent: SolvedLasers, i_laser: int) -> tuple[bool,
     # doi:10.1080/01621459.1995.10476572).
     strong = 6.0
     if evidence > strong:
-        return True, f"bent at its window: {residuals}"
+        return bent, f"bent at its window: {residuals}"
     if evidence < -strong:
-        return False, f"plane, its window left out: {residuals}"
-    return True, f"bent at its window as the rig says, though stripes cannot tell: {residuals}"
+        return flat, f"plane, its window left out: {residuals}"
+    return bent, f"bent at its window as the rig says, though stripes cannot tell: {residuals}"
 
 
 def _fit(solved: SolvedLasers, i_laser: int) -> tuple[float, float]:
@@ -127,8 +114,9 @@ def _fit(solved: SolvedLasers, i_laser: int) -> tuple[float, float]:
     return float(np.sqrt(np.mean(everything))), n_effective
 
 
-# Tilt and offset of a board of paper or foam that is fixed to a wall by hand.
-_LOOSE = BoardPosePrior(float(np.deg2rad(1.0)), 2e-3)
+# Standard deviations of tilts (radians) and offset (metres) of a board of paper or foam that is
+# fixed to a wall by hand.
+_LOOSE = np.array([*np.deg2rad([1.0, 1.0]), 2e-3])
 # Least number of a laser's points in a view.
 _MIN_POINTS = 5
 
@@ -142,8 +130,8 @@ class InitialGuess:
     views: tuple[PlacedView, ...]
     # Numbers that are refined too; None if the camera is held.
     camera_covariance: CameraCovariance | None
-    # Uncertainty of a board's pose on its surface; None if it is the surface.
-    board_pose_prior: BoardPosePrior | None = None
+    # As in `LaserProblem`.
+    board_pose_prior: FloatArray | None = None
     # Error that shifts or turns a whole stripe in its picture.
     shared_error_px: float = 0.0
 
@@ -179,7 +167,8 @@ def solve_lasers(
     names = [laser.name for laser in lasers]
     first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of, names)
     if len(start.surfaces.planes) == 1 and (contradicts(first) if loose is None else loose):
-        error = typical_corner_error_px(start.views)
+        # In each direction, after poses by corners alone.
+        error = float(np.median([view.rms_px for view in start.views]) / np.sqrt(2.0))
         again = replace(start, board_pose_prior=_LOOSE, shared_error_px=error)
     else:
         again, laser_of = _sorted_again(start, first, laser_of, tolerance_px(lasers))
@@ -203,7 +192,11 @@ def _sorted_again(
     state = solved.state
     camera = state.bundle.camera(0)
     views = tuple(
-        replaced(camera, view, pose, start.surfaces)
+        replace(
+            view,
+            dome_from_target=pose,
+            placed=place_stripes(camera, view.stripes, pose, start.surfaces),
+        )
         for view, pose in zip(start.views, state.bundle.poses, strict=True)
     )
     planes = [sheet.plane for sheet in state.sheets]
@@ -269,7 +262,7 @@ def paper_planes(solved: SolvedLasers) -> list[Plane]:
     """Return the planes of all lasers by the paper's method (Eq. 33-36)."""
     camera = solved.problem.bundle.start.camera(0)
     surfaces, planes = solved.problem.surfaces, []
-    spatial = [surfaces.placed(view.spatial.dome_from_target) for view in solved.views]
+    spatial = [surfaces.placed(view.spatial) for view in solved.views]
     for i, sheet in enumerate(solved.state.sheets):
         groups = [solved.problem.groups[k] for k in solved.groups_of(laser=i)]
         points = [points_on(camera, g.pixels, g.surface, spatial[g.view])[0] for g in groups]

@@ -8,7 +8,7 @@ both are reported.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,20 +32,12 @@ from aqualvs.optics.camera import Camera
 _ON_PLANE = 1e-4
 
 
-@dataclass(frozen=True, slots=True)
-class SpatialPose:
-    """A pose by the paper's cost function."""
+def spatial_pose(camera: Camera, view: View, start: SE3) -> SE3:
+    """Return the pose that minimises the paper's V (Eq. 32-33), from one near it.
 
-    dome_from_target: SE3  # The inverse of the paper's (S^G, R_S^G).
-    cost: float  # V of Eq. 32 at its minimum, in square metres.
-    rms: float  # Root mean square distance of corners from their rays, in metres.
-
-
-def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
-    """Minimise the paper's V (Eq. 32-33) from a `dome_from_target` near the solution.
-
-    The view has inlier corners alone: this cost is not robust. Raises `CalibrationError` if fewer
-    than three corners have rays (the paper's minimum).
+    Both are `dome_from_target`, the inverse of the paper's (S^G, R_S^G). The view has inlier
+    corners alone: this cost is not robust. Raises `CalibrationError` if fewer than three corners
+    have rays (the paper's minimum).
     """
     rays = camera.rays(view.pixels)
     n = int(np.count_nonzero(rays.valid))
@@ -65,9 +57,7 @@ def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
         pose = moved_target(pose, middle, step)
         if np.all(np.abs(step[:3]) < small_turn) and np.all(np.abs(step[3:]) < small_shift):
             break
-    missed = np.einsum("nij,nj->ni", across, pose.apply(points) - origins)
-    cost = float(np.sum(missed**2))
-    return SpatialPose(pose, cost, float(np.sqrt(cost / n)))
+    return pose
 
 
 def planes_with_points(view: View, planes: Sequence[Plane]) -> tuple[int, ...]:
@@ -98,7 +88,7 @@ class PlacedView:
     view: View  # Inlier corners.
     stripes: StripePoints  # As found.
     dome_from_target: SE3  # By reprojection.
-    spatial: SpatialPose  # By the paper's cost.
+    spatial: SE3  # The same by the paper's cost.
     placed: PlacedStripes  # Stripe points on the target's surfaces.
     n_corners_rejected: int  # Number of outlier corners.
     rms_px: float  # Root mean square residual of the corners for the pose by them alone.
@@ -164,12 +154,6 @@ def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces
         len(view) - len(believed),
         pose.rms_px,
     )
-
-
-def replaced(camera: Camera, view: PlacedView, pose: SE3, surfaces: TargetSurfaces) -> PlacedView:
-    """Return the picture with another pose, and its stripes placed by that pose."""
-    placed = place_stripes(camera, view.stripes, pose, surfaces)
-    return replace(view, dome_from_target=pose, placed=placed)
 
 
 def pooled(views: Sequence[PlacedView], surfaces: TargetSurfaces) -> PooledStripes:
