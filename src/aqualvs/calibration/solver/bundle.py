@@ -12,7 +12,7 @@ steps (`moved_target`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -37,7 +37,7 @@ class KnownDistance:
     sigma: float  # Its standard deviation, in metres.
 
     def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
-        """Return one residual: found minus given distance."""
+        """Return one residual, found minus given distance, by a step of `moved_target`."""
         normal = dome_from_target.rotation[:, 2]
         found = plane_distance(dome_from_target)
         # normal x (centre - found * y axis), written out.
@@ -74,6 +74,10 @@ class SquareBoard:
             return Block(group, columns[:3], off, slopes, RobustLoss.CAUCHY, scaled=False)
 
         return [block(TILTS, [0, 2], self.board_tilt_sigma), block(ROLLS, [1], self.roll_sigma)]
+
+
+PoseTerm: TypeAlias = KnownDistance | SquareBoard
+"""A prior on the pose of one target."""
 
 
 def plane_distance(dome_from_target: SE3) -> float:
@@ -136,13 +140,6 @@ def _cross(arms: FloatArray, by_point: FloatArray) -> FloatArray:
 
 
 _N_WATER = "n_water"
-
-
-class PoseTerm(Protocol):
-    """A prior on the pose of one target, as residuals."""
-
-    def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
-        """Return residuals and their derivative by a step of the pose, see `moved_target`."""
 
 
 @dataclass(frozen=True, slots=True)

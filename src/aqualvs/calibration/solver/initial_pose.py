@@ -57,12 +57,9 @@ _POSE = _PoseOptions()
 
 @dataclass(frozen=True, slots=True)
 class TargetPose:
-    """A target's pose with its uncertainty."""
+    """A target's pose and how well it fits."""
 
     dome_from_target: SE3  # The pose.
-    # Shape (6, 6): of the step of `bundle.moved_target`: a turn about the middle of the view's
-    # points (radians) and a shift (metres), both in `dome`; camera and medium taken as exact.
-    covariance: FloatArray
     # Root mean square distance of the inliers from their predicted pixels.
     rms_px: float
     # Shape (N,): mask of the view's points that were used.
@@ -108,7 +105,9 @@ def target_pose(
             f"{view.name}: no pose of the target explains its {len(view)} points{fit}; check the "
             "target's file against the print, and the rig and medium against the picture"
         )
-    return _result(best, rival)
+    rms = _rms_px(best)
+    ambiguous = rival is not None and _rms_px(rival) < _POSE.rival * rms + 0.1 * CORNER_SIGMA_PX
+    return TargetPose(best.state, rms, best.inliers[0], ambiguous)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +116,7 @@ class _PoseProblem:
 
     camera: Camera
     view: View
-
-    @property
-    def n_parameters(self) -> int:
-        return 6
+    n_parameters: int = 6
 
     def blocks(self, state: SE3) -> list[Block]:
         points = state.apply(self.view.points)
@@ -282,19 +278,6 @@ def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | Non
     except cv2.error:
         return None
     return pinhole.pose(rotvec, translation) if found else None
-
-
-def _result(best: Solution[SE3], rival: Solution[SE3] | None) -> TargetPose:
-    scale = best.scales[CORNERS]
-    freedom = 2.0 * _believed(best) - 6.0
-    # Number of observations at the nominal noise that are added to a view's own residuals in the
-    # noise estimate: the eight residuals of a single marker leave two degrees of freedom.
-    prior_freedom = 8.0
-    tempered = (freedom * scale**2 + prior_freedom) / (freedom + prior_freedom)
-    rms = _rms_px(best)
-    ambiguous = rival is not None and _rms_px(rival) < _POSE.rival * rms + 0.1 * CORNER_SIGMA_PX
-    covariance = best.covariance * (tempered / scale**2)
-    return TargetPose(best.state, covariance, rms, best.inliers[0], ambiguous)
 
 
 @dataclass(frozen=True, slots=True)
