@@ -110,7 +110,7 @@ def test_derivatives_are_those_of_the_grey_value():
         normal, gradient = np.zeros((N_UNKNOWNS, N_UNKNOWNS)), np.zeros(N_UNKNOWNS)
         residuals = np.zeros(image.shape)
         window = TagWindow(image, np.zeros(2), np.ones(image.shape), cells, 1.1, 1)
-        tag_sums(window, values, normal, gradient, residuals)
+        tag_sums(window, values, normal, gradient, residuals, np.empty(N_UNKNOWNS))
         return normal, residuals
 
     normal, residuals = sums(unknowns)

@@ -40,7 +40,6 @@ N_UNKNOWNS = 22
 BLUR, GAMMA, LEVEL, CONTRAST = 14, 15, 16, 17
 
 
-@inline_borrowing_kernel
 def marker_to_pixel(unknowns: FloatArray, q_0: float, q_1: float) -> tuple[float, float]:
     """Return the pixel of a point of the marker."""
     w = 1.0 + unknowns[6] * q_0 + unknowns[7] * q_1
@@ -220,13 +219,14 @@ class TagWindow(NamedTuple):
     every: int  # Subsampling: 1 takes all pixels, 2 those of one colour of a chessboard.
 
 
-@inner_kernel
+@inner_borrowing_kernel
 def tag_sums(
     window: TagWindow,
     unknowns: FloatArray,
     normal: FloatArray,
     gradient: FloatArray,
     residuals: FloatArray,
+    row: FloatArray,
 ) -> float:
     """Sum the weighted squares of a window's residuals, their normal matrix and gradient.
 
@@ -239,6 +239,8 @@ def tag_sums(
         Written; of `normal` the lower half.
     residuals : array, shape (rows, columns)
         Written: picture minus model; NaN outside the marker.
+    row : array, shape (22,)
+        Work space.
 
     Returns
     -------
@@ -247,18 +249,6 @@ def tag_sums(
     """
     normal[:, :] = 0.0
     gradient[:] = 0.0
-    return _sums(window, unknowns, normal, gradient, residuals, np.empty(N_UNKNOWNS))
-
-
-@inner_borrowing_kernel
-def _sums(
-    window: TagWindow,
-    unknowns: FloatArray,
-    normal: FloatArray,
-    gradient: FloatArray,
-    residuals: FloatArray,
-    row: FloatArray,
-) -> float:
     image, corner, weights, cells, reach, every = window
     squares = 0.0
     rows, columns = weights.shape
@@ -332,8 +322,8 @@ def descend(
     normal, gradient = np.empty((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
     new_normal, new_gradient = np.empty((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
     lower, step = np.zeros((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
-    new_residuals = np.empty_like(residuals)
-    squares = tag_sums(window, unknowns, normal, gradient, residuals)
+    new_residuals, row = np.empty_like(residuals), np.empty(N_UNKNOWNS)
+    squares = tag_sums(window, unknowns, normal, gradient, residuals, row)
     squares += _add_prior(prior, unknowns, normal, gradient)
     damping = 1e-3
     for _ in range(n_steps):
@@ -344,7 +334,7 @@ def descend(
         tried = unknowns + step
         tried[BLUR] = min(max(tried[BLUR], _LOG_BLUR[0]), _LOG_BLUR[1])
         tried[GAMMA] = min(max(tried[GAMMA], _LOG_GAMMA[0]), _LOG_GAMMA[1])
-        new_squares = tag_sums(window, tried, new_normal, new_gradient, new_residuals)
+        new_squares = tag_sums(window, tried, new_normal, new_gradient, new_residuals, row)
         new_squares += _add_prior(prior, tried, new_normal, new_gradient)
         if not new_squares <= squares:
             damping = 10.0 * max(damping, 1e-3)
