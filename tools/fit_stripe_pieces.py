@@ -109,7 +109,7 @@ def _sample(
     name: str, fmt: str, given: real_lines.Image | Frame, nm: float, lines: Array | None
 ) -> Sample:
     frame = given if isinstance(given, Frame) else Frame(0, 0.0, *planes_of_image(given))
-    found = find_all_segments(frame, real_lines.options_for(nm))
+    found = find_all_segments(frame, nm)
     table = np.concatenate([segments.table for segments in found], axis=1)
     is_line = np.zeros(table.shape[1])
     if lines is not None and len(is_line):

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
+from aqualvs.calibrate.uncalibrated_stripes import find_stripes
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources import open_source
 
@@ -86,14 +86,6 @@ class Score:
     found: float
     weakest: float
     elsewhere: int
-
-
-def options_for(wavelength_nm: float) -> UncalibratedStripeOptions:
-    """Return options for a colour, where this version of the package knows colours."""
-    names = {field.name for field in dataclasses.fields(UncalibratedStripeOptions)}
-    if "wavelength_nm" in names:
-        return UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
-    return UncalibratedStripeOptions()
 
 
 def read_image(path: Path) -> Image:
@@ -280,7 +272,7 @@ def shots(
             given = encoded(image, fmt)
             # Without a laser, nothing may be found whatever the colour of the rig's lasers.
             for nm in [RED_NM if red else GREEN_NM] if is_on else [GREEN_NM, RED_NM]:
-                points = find_stripes(given, options_for(nm)).pixels
+                points = find_stripes(given, nm).pixels
                 if line is not None:
                     scores = [score_pair(name, fmt, points, line)]
                 elif name in traced:

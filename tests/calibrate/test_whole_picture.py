@@ -5,11 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from aqualvs.calibrate.uncalibrated_stripes import (
-    StripePixels,
-    UncalibratedStripeOptions,
-    find_stripes,
-)
+from aqualvs.calibrate import uncalibrated_stripes
+from aqualvs.calibrate.uncalibrated_stripes import StripePixels, find_stripes
 from aqualvs.scanning.scan import Frame
 
 SIZE = (360, 240)
@@ -81,20 +78,17 @@ def test_white_edges_and_stripes_of_paint_are_no_laser() -> None:
     assert np.all(np.abs(distances(found, (0.0, 1.0, 100.0))) < 2.0)
 
 
-def test_how_likely_a_piece_must_be_laser_light_is_an_option() -> None:
+def test_a_piece_must_be_likely_to_be_laser_light(monkeypatch: pytest.MonkeyPatch) -> None:
     line = (0.0, 1.0, 200.0)
     image = picture(line, noise=0.5)
     image[100:104, 40:300] = (100, 103, 100)
     assert np.all(np.abs(distances(find_stripes(image), line)) < 2.0)
     # Paint that is less green than the line beside it.
     image[100:104, 40:300] = (100, 118, 100)
-    paint = [
-        np.count_nonzero(np.abs(distances(find_stripes(image, options), line)) > 2.0)
-        for options in (
-            UncalibratedStripeOptions(min_likelihood=0.3),
-            UncalibratedStripeOptions(min_likelihood=0.99),
-        )
-    ]
+    paint = []
+    for likelihood in (0.3, 0.99):
+        monkeypatch.setattr(uncalibrated_stripes, "_MIN_LIKELIHOOD", likelihood)
+        paint.append(np.count_nonzero(np.abs(distances(find_stripes(image), line)) > 2.0))
     assert paint[0] > 200
     assert paint[1] == 0
 
@@ -168,13 +162,14 @@ def test_nothing_in_nothing() -> None:
     assert found.pixels.shape == (0, 2)
 
 
-def test_how_long_a_piece_must_be_is_an_option() -> None:
+def test_a_piece_must_be_long(monkeypatch: pytest.MonkeyPatch) -> None:
     image = picture((0.0, 1.0, 100.0))
     image[:, :200] = picture()[:, :200]
     image[:, 280:] = picture()[:, 280:]
     assert len(find_stripes(image)) > 60
     # 80 px of 360.
-    assert len(find_stripes(image, UncalibratedStripeOptions(min_length_share=0.25))) == 0
+    monkeypatch.setattr(uncalibrated_stripes, "_MIN_LENGTH_SHARE", 0.25)
+    assert len(find_stripes(image)) == 0
 
 
 def test_a_bright_stripe_without_colour_is_no_laser() -> None:
@@ -206,7 +201,7 @@ def test_short_dashes_without_a_certain_line_are_left_out() -> None:
 def test_a_line_of_another_wavelength(wavelength: float, channels: list[int]) -> None:
     line = (0.3, 1.0, 160.0)
     image = np.ascontiguousarray(picture(line)[..., channels])
-    off = distances(find_stripes(image, UncalibratedStripeOptions(wavelength_nm=wavelength)), line)
+    off = distances(find_stripes(image, wavelength), line)
     # Chroma, of half the size, makes half of what is searched, with its noise.
     assert np.sqrt(np.mean(off**2)) < 0.1
     assert len(off) > 0.6 * SIZE[0]
@@ -225,7 +220,7 @@ def test_a_thin_line_is_known_by_the_colour_beside_it() -> None:
     line, half = (0.0, 1.0, 100.3), SIZE[0] // 2
     image = np.ascontiguousarray(picture(line, width=2.0, green=110.0)[..., [0, 2, 1]])
     image[:, half:] = blurred_red(image)[:, half:]
-    found = find_stripes(image, UncalibratedStripeOptions(wavelength_nm=650.0))
+    found = find_stripes(image, 650.0)
     assert np.all(np.abs(distances(found, line)) < 1.0)
     assert np.count_nonzero(found.pixels[:, 0] > half + 8) > 0.95 * (half - 8)
 

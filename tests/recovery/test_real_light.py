@@ -20,7 +20,7 @@ from scipy.special import chdtri
 import real_lines
 import real_wall as wall
 from aqualvs.calibrate import common, lasers
-from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
+from aqualvs.calibrate.uncalibrated_stripes import find_stripes
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import View
@@ -312,8 +312,7 @@ def test_blurred_lines_are_found(tmp_path, picture: str, blurred) -> None:
     assert_on_board(measured_as("crf23", blurred(image), picture, tmp_path))
     whole = in_whole_picture(image)
     assert len(find_stripes(blurred(whole))) > 0.9 * n_stripes_of(picture)
-    red = UncalibratedStripeOptions(wavelength_nm=650.0)
-    assert len(find_stripes(blurred(whole), red)) == 0
+    assert len(find_stripes(blurred(whole), 650.0)) == 0
 
 
 def test_two_photographs_of_fifteen_lines_are_too_few(tmp_path) -> None:

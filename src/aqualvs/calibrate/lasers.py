@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.calibrate import common
-from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
+from aqualvs.calibrate.uncalibrated_stripes import find_stripes
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
@@ -147,9 +147,8 @@ def calibrate_lasers(
     wavelength_nm = _wavelength(wavelength_nm, before)
     target = _detected(pictures, before, box, board, medium, board_offset)
     common.check_same_size(before, target.found)
-    options = UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
     views = tuple(
-        LaserView(view, find_stripes(common.read_colour(picture), options))
+        LaserView(view, find_stripes(common.read_colour(picture), wavelength_nm))
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
     elsewhere = medium is not None or before.is_air(target.n_medium)
@@ -188,7 +187,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     Raises `AqualvsError` as `calibrate_lasers`, or if an output cannot be written.
     """
     check_rig_place(request.out)
-    before = _with_wavelength(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
+    before = load_rig(request.rig, need_lasers=False)
     done = calibrate_lasers(
         common.picture_paths(request.images),
         before,

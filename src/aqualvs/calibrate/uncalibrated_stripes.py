@@ -40,21 +40,13 @@ _MAX_SLOPE = 1.0
 _WIDTH_OF_SIGMA = 2.355
 # Longest side of a map of `cv2.remap`, which must stay below 32768.
 _MAP_LENGTH = 30000
+# Least probability that a segment is a laser's line, by its shape and colour and by the picture's
+# other lines.
+_MIN_LIKELIHOOD = 0.5
 # A segment whose log odds are below the threshold by more than this continues no line.
 _MAX_SHORTFALL = 2.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UncalibratedStripeOptions:
-    """Options of `find_stripes`."""
-
-    # Least probability that a segment is a laser's line, by its shape and colour and by the
-    # picture's other lines.
-    min_likelihood: float = 0.5
-    # Shortest segment that may begin a line, as a share of the picture's width.
-    min_length_share: float = 0.015
-    # Wavelength of the lasers; green if None.
-    wavelength_nm: float | None = None
+# Shortest segment that may begin a line, as a share of the picture's width.
+_MIN_LENGTH_SHARE = 0.015
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,25 +57,23 @@ class StripePixels(StripePoints):
     width: FloatArray  # Shape (N,): full width at half height across the stripe, in pixels.
 
 
-def find_stripes(
-    image: ImagePlane | Frame, options: UncalibratedStripeOptions | None = None
-) -> StripePixels:
+def find_stripes(image: ImagePlane | Frame, wavelength_nm: float | None = None) -> StripePixels:
     """Find laser lines: thin, long, of the lasers' colour, and similar to each other.
 
     The picture is grey (height, width), or BGR as OpenCV reads it (height, width, 3); in a grey one
     every thin bright line counts. Each segment is searched along the axis that crosses it at the
-    larger angle. Empty if no segment is certain.
+    larger angle. `wavelength_nm` is that of the lasers; green if None. Empty if no segment is
+    certain.
     """
-    options = options or UncalibratedStripeOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
     frame = without_neutral_chroma(frame)
     width = frame.luma.shape[1]
-    found = find_all_segments(frame, options)
+    found = find_all_segments(frame, wavelength_nm)
     table = np.concatenate([segments.table for segments in found], axis=1)
     log_odds = line_log_odds(table, width, has_colour=frame.chroma is not None)
-    least = math.log(options.min_likelihood / (1.0 - options.min_likelihood))
+    least = math.log(_MIN_LIKELIHOOD / (1.0 - _MIN_LIKELIHOOD))
     size_px = width, frame.luma.shape[0]
-    line = continued(found, log_odds, least, options.min_length_share * width, size_px)
+    line = continued(found, log_odds, least, _MIN_LENGTH_SHARE * width, size_px)
     lines: dict[int, list[StripePixels]] = {}
     first = 0
     for segments in found:
@@ -106,13 +96,13 @@ def find_stripes(
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 
-def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[StripeSegments]:
+def find_all_segments(frame: Frame, wavelength_nm: float | None) -> list[StripeSegments]:
     """Find the segments of all lines, laser light or not, one set for each search axis.
 
-    Of the options, the wavelength selects the channel in which lines are brightest.
+    The wavelength of the lasers, green if None, selects the channel in which lines are brightest.
     """
     size_px = frame.luma.shape[1], frame.luma.shape[0]
-    colour, line_px = LaserColour.of(options.wavelength_nm), pixels_per_line(size_px)
+    colour, line_px = LaserColour.of(wavelength_nm), pixels_per_line(size_px)
     found = []
     for axis in SearchAxis:
         # A band that covers the whole picture, for slopes up to `_MAX_SLOPE`.
