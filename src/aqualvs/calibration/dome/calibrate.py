@@ -35,7 +35,6 @@ from aqualvs.calibration.dome.problem import (
     check_sets,
     compare_with_bare_lens,
     dome_problem,
-    initial_rigs,
     place_names,
     with_board_tilt_as_found,
 )
@@ -50,24 +49,20 @@ from aqualvs.calibration.solver.result import (
 )
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.solved import rig_numbers, rig_uncertainty
 
 _SIZES = ("inner_radius", "thickness", "n_acrylic", "n_port")
 _WORDS = {
+    **{f"lens_{axis}": f"lens {axis}" for axis in "xyz"},
+    **{f"rotation_{axis}": f"rotation about {axis}" for axis in "xyz"},
+    **{f"port_tilt_{axis}": f"tilt of the port about {axis}" for axis in "xy"},
     "inner_radius": "inner radius",
     "thickness": "thickness",
     "n_acrylic": "acrylic index",
     "n_port": "index of the port",
     "port_distance": "distance of the port",
-    "port_tilt_x": "tilt of the port about x",
-    "port_tilt_y": "tilt of the port about y",
-    "lens_x": "lens x",
-    "lens_y": "lens y",
-    "lens_z": "lens z",
-    "rotation_x": "rotation about x",
-    "rotation_y": "rotation about y",
-    "rotation_z": "rotation about z",
 }
 
 
@@ -143,26 +138,20 @@ def _rotation(problem: DomeProblem, result: DomeCalibration, shared_tilt_sigma: 
 
 
 def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:
-    # Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
-    # something.
-    learnt_nothing, learnt_something = 0.9, 0.5
-
-    def size(name: str) -> str:
-        sigma = result.uncertainty.sigmas[name]
-        return f"{sigma:.4f}" if name.startswith("n_") else f"{1e3 * sigma:.3f} mm"
-
-    lines = []
-    nothing = seen.undetermined(names, learnt_nothing)
-    some = [n for n in seen.undetermined(names, learnt_something) if n not in nothing]
-    rest = [n for n in names if n in seen.shrinkage and n not in nothing and n not in some]
-    for group, what in (
-        (nothing, "not determined by the pictures, taken as given"),
-        (some, "hardly determined by the pictures, mostly taken as given"),
-        (rest, "determined by the pictures"),
-    ):
-        if group:
-            listed = ", ".join(f"{_WORDS[name]} (± {size(name)})" for name in group)
-            lines.append(f"{listed}: {what}")
+    # By the least ratio of sigma to the prior's sigma: 1 if nothing was learnt.
+    verdicts = {
+        0.9: "not determined by the pictures, taken as given",
+        0.5: "hardly determined by the pictures, mostly taken as given",
+        -np.inf: "determined by the pictures",
+    }
+    groups: dict[str, list[str]] = {verdict: [] for verdict in verdicts.values()}
+    for name in names:
+        if name in seen.shrinkage:
+            verdict = next(v for least, v in verdicts.items() if not seen.shrinkage[name] <= least)
+            sigma = result.uncertainty.sigmas[name]
+            size = f"{sigma:.4f}" if name.startswith("n_") else f"{1e3 * sigma:.3f} mm"
+            groups[verdict].append(f"{_WORDS[name]} (± {size})")
+    lines = [f"{', '.join(group)}: {verdict}" for verdict, group in groups.items() if group]
     exact = [_WORDS[name] for name in names if name not in seen.shrinkage]
     if exact:
         lines.append(f"{', '.join(exact)}: taken as exact")
@@ -316,7 +305,12 @@ def _solved(
     trouble: list[CalibrationError | RigError] = []
     # A solve with smaller residuals has found the minimum; one with larger ones may be in another.
     good_noise_px = 0.5
-    for start in initial_rigs(rig):
+    starts = [rig]
+    if rig.flat_port is None:
+        # A lens position far to the wrong side may leave no pose of a board to start from; from the
+        # centre solves converge.
+        starts.append(replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3))))
+    for start in starts:
         try:
             problem = dome_problem(start, sets, known, options)
         except CalibrationError as error:

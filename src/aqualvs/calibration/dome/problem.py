@@ -14,7 +14,7 @@ Cross-validation: the dome's prediction of unused corners against that of a bare
 (`compare_with_bare_lens`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -25,7 +25,6 @@ from aqualvs.calibration.solver.bundle import (
     Bundle,
     BundleState,
     KnownDistance,
-    PoseTerm,
     SquareBoard,
     TargetView,
 )
@@ -73,10 +72,6 @@ class BoardSet:
     def __post_init__(self) -> None:
         if self.poses and len(self.poses) != len(self.views):
             raise ValueError(f"{len(self.poses)} poses given for {len(self.views)} views")
-
-    def given(self, i_view: int) -> BoardPose | None:
-        """Return the measurements of a view's board."""
-        return self.poses[i_view] if self.poses else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,11 +197,7 @@ class DomeProblem:
     @property
     def measured_views(self) -> list[int]:
         """Indices of views whose board's distance is given and used."""
-        return [
-            i
-            for i, view in enumerate(self.bundle.views)
-            if any(isinstance(term, KnownDistance) for term in view.known)
-        ]
+        return [i for i, view in enumerate(self.bundle.views) if view.distance is not None]
 
     def given_distance(self, i_view: int) -> float:
         """Return the given distance of a view's board; NaN if none is given."""
@@ -235,41 +226,30 @@ class DomeProblem:
 
     def without_distances(self, wrong: Sequence[int]) -> "DomeProblem":
         """Return the problem without some of the given distances."""
-        views = list(self.bundle.views)
-        for i in wrong:
-            known = tuple(t for t in views[i].known if not isinstance(t, KnownDistance))
-            views[i] = replace(views[i], known=known)
-        return replace(self, bundle=replace(self.bundle, views=tuple(views)))
+        views = tuple(
+            replace(view, distance=None) if i in wrong else view
+            for i, view in enumerate(self.bundle.views)
+        )
+        return replace(self, bundle=replace(self.bundle, views=views))
 
     def with_board_tilt_prior(self, sigma: float) -> "DomeProblem":
         """Return the problem with another prior scale of the boards' tilt."""
-        views = []
-        for view in self.bundle.views:
-            known = tuple(
-                replace(term, board_tilt_sigma=sigma) if isinstance(term, SquareBoard) else term
-                for term in view.known
-            )
-            views.append(replace(view, known=known))
-        return replace(self, bundle=replace(self.bundle, views=tuple(views)))
+        views = tuple(
+            view
+            if view.square is None
+            else replace(view, square=replace(view.square, board_tilt_sigma=sigma))
+            for view in self.bundle.views
+        )
+        return replace(self, bundle=replace(self.bundle, views=views))
 
 
 def shots_of(sets: Sequence[BoardSet]) -> list[Shot]:
     """Return all views of all sets."""
     return [
-        Shot(f"{one.name}: {view.name}" if len(sets) > 1 else view.name, view, i_set, one.given(i))
+        Shot(f"{one.name}: {view.name}" if len(sets) > 1 else view.name, view, i_set, given)
         for i_set, one in enumerate(sets)
-        for i, view in enumerate(one.views)
+        for view, given in zip(one.views, one.poses or [None] * len(one.views), strict=True)
     ]
-
-
-def initial_rigs(rig: Rig) -> Iterator[Rig]:
-    """Yield the rig, then the same with its lens at the dome's centre, where solves converge.
-
-    A stated lens position far to the wrong side may leave no pose of a board to start from.
-    """
-    yield rig
-    if rig.flat_port is None:
-        yield replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
 
 
 def dome_problem(
@@ -292,11 +272,7 @@ def dome_problem(
     free = (*place_names(rig), *rotation, *(name for name in priors.names if name not in ROTATION))
     views = tuple(
         TargetView(
-            shot.view,
-            shot.i_set,
-            pose,
-            fixed=shot.kind is PoseKind.EXACT,
-            known=_known(shot, square, options),
+            shot.view, shot.i_set, pose, shot.kind is PoseKind.EXACT, *_known(shot, square, options)
         )
         for shot, pose in zip(shots, poses, strict=True)
     )
@@ -345,9 +321,11 @@ def _why_none(rig: Rig, sets: Sequence[BoardSet]) -> str | None:
     return implausible_distance(np.array([*found.values()]), [*found]) if found else None
 
 
-def _known(shot: Shot, square: FloatArray, options: DomeOptions) -> tuple[PoseTerm, ...]:
+def _known(
+    shot: Shot, square: FloatArray, options: DomeOptions
+) -> tuple[KnownDistance | None, SquareBoard | None]:
     if shot.given is None or shot.given.distance is None or shot.kind is PoseKind.EXACT:
-        return ()
+        return None, None
     return (
         KnownDistance(shot.given.distance, options.distance_sigma),
         SquareBoard(square, options.tilt_sigma, options.tilt_sigma),

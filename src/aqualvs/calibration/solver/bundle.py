@@ -12,7 +12,6 @@ steps (`moved_target`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -74,10 +73,6 @@ class SquareBoard:
             return Block(group, columns[:3], off, slopes, RobustLoss.CAUCHY, scaled=False)
 
         return [block(TILTS, [0, 2], self.board_tilt_sigma), block(ROLLS, [1], self.roll_sigma)]
-
-
-PoseTerm: TypeAlias = KnownDistance | SquareBoard
-"""A prior on the pose of one target."""
 
 
 def plane_distance(dome_from_target: SE3) -> float:
@@ -150,7 +145,9 @@ class TargetView:
     medium: int  # Index into `BundleState.media`.
     dome_from_target: SE3  # Initial guess of the pose, or the exact pose.
     fixed: bool = False  # Whether the pose is exact.
-    known: tuple[PoseTerm, ...] = ()  # Priors on the pose.
+    # Priors on the pose.
+    distance: KnownDistance | None = None
+    square: SquareBoard | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +268,8 @@ class Bundle:
             block
             for i, (target, pose) in enumerate(zip(self.views, state.poses, strict=True))
             if not target.fixed
-            for term in target.known
+            for term in (target.distance, target.square)
+            if term is not None
             for block in term.blocks(pose, pose.apply(target.view.middle), self.pose_columns(i))
         ]
 

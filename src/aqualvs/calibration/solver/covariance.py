@@ -130,10 +130,6 @@ class Observability:
         least_gain = 0.1
         return [direction for direction in self.directions if direction.gain < least_gain]
 
-    def undetermined(self, names: Sequence[str], limit: float) -> list[str]:
-        """Return those of the names that the data hardly determine."""
-        return [name for name in names if self.shrinkage.get(name, 0.0) > limit]
-
 
 def observability(
     bundle: Bundle,
