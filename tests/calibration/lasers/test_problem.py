@@ -13,7 +13,6 @@ from aqualvs.calibration.lasers.stripes_on_planes import (
     board_surface,
     correlation_factor,
     with_gain,
-    with_shared_error,
 )
 from aqualvs.calibration.solver.bundle import Bundle, BundleState, TargetView
 from aqualvs.optics.rig import Rig, RigUncertainty
@@ -143,7 +142,7 @@ def test_bins_keep_surfaces_apart_and_heed_noise() -> None:
 
 
 def test_a_shared_error_bounds_what_a_stripe_tells() -> None:
-    group = with_shared_error(binned(0, 0, line(1200), np.zeros(1200, np.int64)), 0.3)
+    group = binned(0, 0, line(1200), np.zeros(1200, np.int64), 0.3)
     information = float(np.sum(1.0 / group.sigma_px**2))
     # A place and a direction, each as good as the shared error.
     assert information == pytest.approx(2.0 / 0.3**2, rel=0.02)

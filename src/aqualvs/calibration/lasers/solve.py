@@ -22,7 +22,6 @@ from aqualvs.calibration.lasers.stripes_on_planes import (
     place_stripes,
     points_on,
     with_gain,
-    with_shared_error,
 )
 from aqualvs.calibration.lasers.views import PlacedView, pooled, split_by_view
 from aqualvs.calibration.solver.bundle import Bundle, BundleState, TargetView
@@ -218,8 +217,8 @@ def _solve_from(
             members = np.flatnonzero(mine == i_laser)
             if len(members) >= _MIN_POINTS:
                 stripes = view.stripes.at(view.placed.index[members])
-                group = binned(i_view, i_laser, stripes, view.placed.surface[members])
-                group = with_shared_error(group, start.shared_error_px)
+                surface = view.placed.surface[members]
+                group = binned(i_view, i_laser, stripes, surface, start.shared_error_px)
                 groups.append(with_gain(group, camera, planes, sheet))
     problem = LaserProblem(
         start.bundle(), start.surfaces, tuple(groups), len(sheets), start.board_pose_prior

@@ -265,11 +265,15 @@ class StripeGroup:
         return len(self.counts)
 
 
-def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -> StripeGroup:
+def binned(
+    i_view: int, i_laser: int, points: StripePoints, surface: IntArray, shared_error_px: float = 0.0
+) -> StripeGroup:
     """Put the points of one stripe, on surfaces (N,), into bins along it, with a gain of 1.
 
     Within a bin a stripe is straight to a hundredth of a pixel, so that means of pixels can
-    replace means of residuals.
+    replace means of residuals. `shared_error_px`: standard deviation of a shift and turn of the
+    whole stripe in its picture; all bins together determine place and direction no better than
+    that.
     """
     order, starts = _ordered(points.pixels, surface)
     weights = 1.0 / points.sigma_px[order] ** 2
@@ -290,7 +294,9 @@ def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -
         across=across / np.linalg.norm(across, axis=1, keepdims=True),
         surface=surface[order][starts],
         # A full bin counts as one point, for its points share most of their error.
-        sigma_px=np.sqrt(counts.max() / total),
+        sigma_px=np.hypot(
+            np.sqrt(counts.max() / total), shared_error_px * np.sqrt(0.5 * len(starts))
+        ),
         counts=counts.astype(np.int64),
         gain=np.ones(len(starts)),
     )
@@ -358,16 +364,6 @@ def with_gain(
     by_across = solve_on_surface(by_point, normals, right)[..., 0]
     gain = np.einsum("ni,ni->n", sheet.gradient(points), by_across)
     return replace(group, gain=np.abs(gain))
-
-
-def with_shared_error(group: StripeGroup, error_px: float) -> StripeGroup:
-    """Return the group with the noise of its bins raised by an error that they share.
-
-    `error_px`: standard deviation of a shift and turn of the whole stripe in its picture. All bins
-    together then determine place and direction no better than that.
-    """
-    shared = error_px * np.sqrt(0.5 * len(group))
-    return replace(group, sigma_px=np.hypot(group.sigma_px, shared))
 
 
 def correlation_factor(sequences: Sequence[FloatArray]) -> float:
