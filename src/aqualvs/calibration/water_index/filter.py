@@ -335,7 +335,8 @@ def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
 
     Arguments as in `compare`.
     """
-    state = state.with_slopes_near()
+    if abs(state.n - state.n_of_slopes) > FAR:
+        state = replace(state, n_of_slopes=state.n)
     state = model.settled(state, model.line(state, frame), frame)
     at, weights = state, np.ones(len(frame.ids))
     rejected = 1e-6

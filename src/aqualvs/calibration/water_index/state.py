@@ -159,12 +159,6 @@ class IndexState:
             self, mean=mean, covariance=covariance, random_variance=self.random_variance + WIDE**2
         )
 
-    def with_slopes_near(self) -> "IndexState":
-        """Return the state with new derivatives if the index has changed much since the last."""
-        if abs(self.n - self.n_of_slopes) <= FAR:
-            return self
-        return replace(self, n_of_slopes=self.n)
-
     def with_corners(self, ids: tuple[int, ...], sigma_px: float) -> "IndexState":
         """Return the state with entries for new corners."""
         new = tuple(i for i in ids if i not in self.ids)
@@ -395,14 +389,11 @@ class CusumTest:
             self._lengths[side] = self._lengths[side] + 1 if total > 0.0 else 0
             if total > limit:
                 began = self._lengths[side]
-                self.forget()
+                # As after a jump; the inflation stays.
+                self._sums, self._lengths, self._block = [0.0, 0.0], [0, 0], []
                 return began
         self._spread(standardised)
         return 0
-
-    def forget(self) -> None:
-        """Reset the sums, as after a jump; keep the inflation."""
-        self._sums, self._lengths, self._block = [0.0, 0.0], [0, 0], []
 
     def _spread(self, standardised: float) -> None:
         self._block.append(standardised)
