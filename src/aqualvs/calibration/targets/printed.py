@@ -335,7 +335,6 @@ class Paper:
     """Sheet of paper in one of its two orientations."""
 
     size_mm: tuple[float, float] | None  # Width and height; None for paper that fits.
-    name: str  # Name in messages.
 
     @property
     def room_mm(self) -> tuple[float, float]:
@@ -352,10 +351,10 @@ def papers(word: str) -> tuple[Paper, Paper]:
     """
     key = word.strip().lower()
     if key == FIT:
-        return Paper(None, FIT), Paper(None, FIT)
+        return Paper(None), Paper(None)
     if key in PAPERS_MM:
         width, height = PAPERS_MM[key]
-        return Paper((width, height), key.upper()), Paper((height, width), f"{key.upper()} across")
+        return Paper((width, height)), Paper((height, width))
     match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", key)
     if match is None:
         raise OptionError(
@@ -367,7 +366,7 @@ def papers(word: str) -> tuple[Paper, Paper]:
         raise OptionError(
             f"--paper {word}: too small for the ruler of 100 mm; take at least 116x116"
         )
-    return Paper((width, height), word), Paper((height, width), f"{height:g}x{width:g}")
+    return Paper((width, height)), Paper((height, width))
 
 
 def best_paper(word: str, width: float, height: float, what: str) -> Paper:
