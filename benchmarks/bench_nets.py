@@ -17,11 +17,11 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.labels import label_candidates
-from aqualvs.scanning.laser_bands import plan_bands, search_range
+from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import find_surfaces
+from aqualvs.scanning.surfaces import SurfaceFinder
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
@@ -112,8 +112,7 @@ def _cost() -> list[dict[str, Any]]:
 def _label_ms(candidates: Candidates, laser_bands: Any) -> float:
     rig = example_rig()
     linked = candidates.linked()
-    reach = search_range(rig.working_range)
-    surfaces = find_surfaces(linked.subsegments, candidates.pixels, 3, reach, rig.focal_px)
+    surfaces = SurfaceFinder(rig).find(linked)
     target = choose_target(surfaces, TargetKind.AUTO, rig.working_range)
     assert target is not None
     found = PostureEstimator(rig, laser_bands, FitMethod.ROBUST).measure(

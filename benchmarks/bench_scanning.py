@@ -30,7 +30,7 @@ from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import find_surfaces
+from aqualvs.scanning.surfaces import SurfaceFinder
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
@@ -191,16 +191,14 @@ def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
     detector = FrameDetector(rig.size_px, laser_bands, StripeOptions())
     triangulator = Triangulator(rig, camera)
     processor = PostureEstimator(rig, laser_bands, FitMethod.ROBUST)
-    near, far = rig.working_range
+    finder = SurfaceFinder(rig)
     peaks = detector.detect(case.frame)
     candidates = find_candidates(peaks, laser_bands, triangulator)
 
     def surfaces() -> tuple[Subsegments, Any]:
-        subsegments = candidates.linked().subsegments
-        found = find_surfaces(
-            subsegments, candidates.pixels, len(rig.lasers), (0.8 * near, 1.2 * far), rig.focal_px
-        )
-        return subsegments, choose_target(found, TargetKind.AUTO, rig.working_range)
+        linked = candidates.linked()
+        found = finder.find(linked)
+        return linked.subsegments, choose_target(found, TargetKind.AUTO, rig.working_range)
 
     subsegments, target = surfaces()
     assert target is not None

@@ -21,7 +21,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.stripe import ThresholdOptions, flank_difference
-from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.surfaces import Surface, SurfaceFinder
 from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from fan_cases import Fan, fan_rig
@@ -526,11 +526,12 @@ def test_a_wall_whose_lines_look_broken_is_measured_as_one(
 ) -> None:
     """Noise breaks dim lines like twine; too few strands are left for a net's posture."""
 
-    def broken_surfaces(*arguments: Any) -> list[Surface]:
-        found = find_surfaces(*arguments)
-        return [replace(one, is_mesh=True, is_unbroken=True) for one in found]
+    find = SurfaceFinder.find
 
-    monkeypatch.setattr("aqualvs.scanner.find_surfaces", broken_surfaces)
+    def find_broken(*arguments: Any) -> list[Surface]:
+        return [replace(one, is_mesh=True, is_unbroken=True) for one in find(*arguments)]
+
+    monkeypatch.setattr(SurfaceFinder, "find", find_broken)
     rig = example_rig()
     peaks = peaks_of(rig, [(plane(0.6, 4.0), lit)], 0.05)
     scan = Scanner(rig).measure(0, 0.0, peaks)

@@ -21,7 +21,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod, Measurement, PostureEstimator
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
-from aqualvs.scanning.surfaces import Surface, find_surfaces, not_on_others
+from aqualvs.scanning.surfaces import Surface, SurfaceFinder, not_on_others
 from aqualvs.scanning.target import TargetChoice, TargetKind, TargetSelector, is_better
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -105,6 +105,7 @@ class Scanner:
 
         camera = camera or rig.camera()
         self._triangulator = Triangulator(rig, camera)
+        self._surface_finder = SurfaceFinder(rig)
         fields = {rig.shutter.field_of(index) for index in range(2)}
         self._searches = {field: self._make_search(camera, field) for field in fields}
         laser_bands = self._search(0).laser_bands
@@ -242,7 +243,7 @@ class Scanner:
         return _StripeSearch(
             laser_bands,
             FrameDetector(self.rig.size_px, laser_bands, self.options.detector, field),
-            TargetSelector(self.rig, self.options.target, assignment),
+            TargetSelector(self.rig, self.options.target, assignment, self._surface_finder),
         )
 
     def _search(self, index: int) -> _StripeSearch:
@@ -254,13 +255,7 @@ class Scanner:
         """Return the posture, the labelled points, and the rows of their candidates."""
         # Planes that several lasers agree on.
         linked = candidates.linked()
-        surfaces = find_surfaces(
-            linked.subsegments,
-            candidates.pixels,
-            len(self.rig.lasers),
-            search_range(self.rig.working_range),
-            self.rig.focal_px,
-        )
+        surfaces = self._surface_finder.find(linked)
         # The target among them, and the posture from its points outside crossing zones.
         choice = targets.choose(linked, surfaces)
         measurement = self._measure_target(linked, choice, targets, has_colour)

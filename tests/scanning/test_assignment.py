@@ -25,7 +25,7 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands, sample_bands
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, surface_on
+from aqualvs.scanning.surfaces import Surface, SurfaceFinder
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
@@ -287,9 +287,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
         parts: list[dict[SearchAxis, StripePeaks]], *, share: float = 1.0, mesh: bool = True
     ) -> bool:
         subsegments = find_candidates(joined(parts), laser_bands, triangulator).linked().subsegments
-        target, other = (
-            surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (far, near)
-        )
+        target, other = (SurfaceFinder(rig).on_plane(subsegments, one) for one in (far, near))
         target = replace(target, is_mesh=True)
         other = replace(other, is_mesh=mesh, sampling_weight=share * target.sampling_weight)
         assert test.nearer_net(subsegments, [target, other], other) is None
@@ -303,7 +301,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     assert not nearer_net([parts[0], net_mask])
     scanner, peaks = Scanner(rig), joined(parts)
     subsegments = find_candidates(peaks, laser_bands, triangulator).linked().subsegments
-    other = surface_on(near, subsegments, len(rig.lasers), 850.0)
+    other = SurfaceFinder(rig).on_plane(subsegments, near)
     assert scanner.measure(0, 0.0, peaks).posture
     monkeypatch.setattr(assignment.AssignmentTest, "nearer_net", lambda *_: other)
     refused = scanner.measure(0, 0.0, peaks).posture
@@ -363,7 +361,7 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
         ]
         linked = find_candidates(joined([*low, *loose]), laser_bands, triangulator).linked()
         subsegments = linked.subsegments
-        target = replace(surface_on(net, subsegments, len(rig.lasers), 850.0), is_mesh=True)
+        target = replace(SurfaceFinder(rig).on_plane(subsegments, net), is_mesh=True)
         return test.is_by_chance(linked, [target], target)
 
     # A third of the light, and an eighth of it on few strands.
@@ -402,7 +400,7 @@ def test_two_lasers_show_any_plane_evenly(one_of: int, is_chance: bool) -> None:
             )
     linked = find_candidates(joined(parts), laser_bands, triangulator).linked()
     subsegments = linked.subsegments
-    target = replace(surface_on(net, subsegments, len(rig.lasers), 850.0), is_mesh=True)
+    target = replace(SurfaceFinder(rig).on_plane(subsegments, net), is_mesh=True)
     assert test.is_by_chance(linked, [target], target) is is_chance
 
 
@@ -419,7 +417,7 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     ) -> Surface | None:
         linked = find_candidates(joined([part, behind]), laser_bands, triangulator).linked()
         subsegments = linked.subsegments
-        near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
+        near, far = (SurfaceFinder(rig).on_plane(subsegments, one) for one in (net, wall))
         near, far = replace(near, is_mesh=mesh), replace(far, is_mesh=wall_is_mesh)
         assert test.overlooked(linked, [far, near], near) is None
         return test.overlooked(linked, [far, near], far)
@@ -473,7 +471,7 @@ def test_a_net_before_a_wall_that_its_shadows_break_is_not_overlooked(share: flo
     seen = [peaks_of(rig, [one], 0.1) for one in ((net, strands), (wall, between_strands))]
     linked = find_candidates(joined(seen), laser_bands, triangulator).linked()
     subsegments = linked.subsegments
-    near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
+    near, far = (SurfaceFinder(rig).on_plane(subsegments, one) for one in (net, wall))
     far = replace(far, is_mesh=True, is_unbroken=False, extent=near.extent)
     near = replace(near, extent=share * near.extent)
     test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)

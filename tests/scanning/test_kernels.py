@@ -57,12 +57,11 @@ def test_cells_are_six_pixels_wide_and_light_their_neighbours(size_px: tuple[int
     pixels = rng.uniform((-0.5, -0.5), np.array(size_px) - 0.5, (3000, 2))
     # Search lines are whole numbers, so that many readings lie on borders of cells.
     pixels[::2, 0], pixels[1::2, 1] = np.rint(pixels[::2, 0]), np.rint(pixels[1::2, 1])
-    cell = np.empty(len(pixels), np.int64)
-    n_cells, n_columns = number_cells(pixels, cell)
+    cells = number_cells(pixels)
     row, column = np.maximum(pixels.astype(np.int64), 0).T[::-1] // 6
-    np.testing.assert_array_equal(cell, (row + 1) * n_columns + column + 1)
+    np.testing.assert_array_equal(cells.of_candidate, (row + 1) * cells.n_columns + column + 1)
     explained = rng.random(len(pixels)) < 0.1
-    lit = lit_cells(cell, explained, n_cells, n_columns)[cell] != 0
+    lit = lit_cells(cells, explained)[cells.of_candidate] != 0
     near_row = np.abs(row[:, None] - row[explained]) <= 1
     near_column = np.abs(column[:, None] - column[explained]) <= 1
     np.testing.assert_array_equal(lit, (near_row & near_column).any(axis=1))

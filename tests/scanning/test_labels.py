@@ -15,7 +15,7 @@ from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.segments import ComponentShapes
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, find_surfaces
+from aqualvs.scanning.surfaces import Surface, SurfaceFinder
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
 from scanning_cases import Lit, behind_strands, everywhere, peaks_of, strands
@@ -44,7 +44,7 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
     linked = candidates.linked()
     subsegments = linked.subsegments
-    surfaces = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
+    surfaces = SurfaceFinder(rig).find(linked)
     target = None
     in_posture = np.zeros(candidates.n, np.bool_)
     if posture_to is not None:

@@ -12,7 +12,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, find_surfaces, surface_on
+from aqualvs.scanning.surfaces import Surface, SurfaceFinder
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
@@ -48,15 +48,8 @@ def surfaces_of(
     candidates = find_candidates(
         peaks_of(rig, targets, noise_px), plan_bands(rig, camera), Triangulator(rig, camera)
     )
-    subsegments = candidates.linked().subsegments
-    found = find_surfaces(
-        subsegments,
-        candidates.pixels,
-        len(rig.lasers),
-        rig.working_range,
-        max(rig.lens.fx, rig.lens.fy),
-    )
-    return found, candidates, subsegments.of_candidate
+    linked = candidates.linked()
+    return SurfaceFinder(rig).find(linked), candidates, linked.subsegments.of_candidate
 
 
 def assert_near(found: Plane, expected: Plane, share: float = 0.01, deg: float = 1.5) -> None:
@@ -203,8 +196,7 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
         )
     camera = rig.camera()
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
-    subsegments = candidates.linked().subsegments
-    found = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
+    found = SurfaceFinder(rig).find(candidates.linked())
     # Chance puts some specks on a plane, never a fifth of them.
     assert all(surface.n_lines < 0.2 * candidates.n for surface in found)
 
@@ -310,5 +302,5 @@ def test_light_far_behind_a_plane_is_not_on_it_however_far_a_pixel_moves_it() ->
     # At 20 m, where a pixel is worth a kilometre.
     table[:3, last], table[3:6, last] = 40.0 * place, 40.0**2 * place
     far = subsegments._replace(table=table)
-    assert surface_on(wall, subsegments, len(rig.lasers), 850.0).members[last]
-    assert not surface_on(wall, far, len(rig.lasers), 850.0).members[last]
+    assert SurfaceFinder(rig).on_plane(subsegments, wall).members[last]
+    assert not SurfaceFinder(rig).on_plane(far, wall).members[last]

@@ -540,8 +540,8 @@ def other_lines_share(
         if members[c]:
             lit[laser[i], line[i]] = True
             of_surface += candidates.confidence[i]
-    cell = np.empty_like(source)
-    stripes = lit_cells(cell, members[of_candidate], *number_cells(candidates.pixels, cell))
+    cells = number_cells(candidates.pixels)
+    stripes, cell = lit_cells(cells, members[of_candidate]), cells.of_candidate
     for i in range(source.shape[0]):
         is_other = lit[laser[i], line[i]] and not own[source[i]] and not stripes[cell[i]]
         if is_other and is_straight(shapes, candidates.component[i]):

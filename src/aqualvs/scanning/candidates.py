@@ -123,10 +123,13 @@ class Candidates(NamedTuple):
     def linked(self) -> "LinkedCandidates":
         """Summarise the subsegments by their centroids; describe the components by their shapes."""
         n = count_subsegments(self.subsegment)
-        of_candidate, numbers = np.empty(self.n, np.int64), np.empty((4, n), np.int64)
-        table, intensity_weight, width = np.empty((7, n)), np.empty(n), np.empty(n)
-        shapes = summarise_subsegments(self, of_candidate, table, intensity_weight, width, numbers)
-        found = Subsegments(of_candidate, table, intensity_weight, width, *numbers)
+        found = Subsegments(
+            np.empty(self.n, np.int64),
+            np.empty((7, n)),
+            *np.empty((2, n)),
+            *np.empty((4, n), np.int64),
+        )
+        shapes = summarise_subsegments(self, found)
         return LinkedCandidates(self, found, ComponentShapes(*shapes))
 
 
@@ -224,45 +227,21 @@ def count_subsegments(subsegment: IntArray) -> int:
 
 
 @lazy_kernel
-def summarise_subsegments(
-    candidates: Candidates,
-    of_candidate: IntArray,
-    table: FloatArray,
-    intensity_weight: FloatArray,
-    width: FloatArray,
-    numbers: IntArray,
-) -> FloatArray:
-    """Summarise N candidates in C subsegments.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        N of them.
-    of_candidate : int array, shape (N,)
-    table : array, shape (7, C)
-    intensity_weight, width : array, shape (C,)
-        Written, as in `Subsegments`.
-    numbers : int array, shape (4, C)
-        Written: n_lines, first_line, last_line and laser of `Subsegments`.
-
-    Returns
-    -------
-    array, shape (6, S)
-        From `describe_components`.
-    """
+def summarise_subsegments(candidates: Candidates, found: Subsegments) -> FloatArray:
+    """Write the subsegments of candidates; return the fields (6, S) of their `ComponentShapes`."""
     line, begin = candidates.line, ZERO
-    for c in range(intensity_weight.shape[0]):
+    for c in range(found.laser.shape[0]):
         end = run_end(candidates.subsegment, begin)
         for i in range(begin, end):
-            of_candidate[i] = c
-        numbers[0, c], numbers[1, c], numbers[2, c] = end - begin, line[begin], line[end - 1]
-        numbers[3, c] = candidates.laser[begin]
+            found.of_candidate[i] = c
+        found.n_lines[c], found.laser[c] = end - begin, candidates.laser[begin]
+        found.first_line[c], found.last_line[c] = line[begin], line[end - 1]
         total, wide = 0.0, 0.0
         for i in range(begin, end):
             total += candidates.confidence[i]
             wide += candidates.width[i]
-        intensity_weight[c], width[c] = total, wide / (end - begin)
-        _write_centroid(candidates, begin, end, table, c)
+        found.intensity_weight[c], found.width[c] = total, wide / (end - begin)
+        _write_centroid(candidates, begin, end, found.table, c)
         begin = end
     shapes = describe_components(
         candidates.component,
@@ -272,7 +251,7 @@ def summarise_subsegments(
         candidates.width,
         candidates.height,
     )
-    _write_sampling_weights(numbers[0], candidates.component, intensity_weight, shapes, table[6])
+    _write_sampling_weights(found, candidates.component, shapes)
     return shapes
 
 
@@ -298,14 +277,8 @@ def _write_centroid(
 
 
 @inner_kernel
-def _write_sampling_weights(
-    n_lines: IntArray,
-    component: IntArray,
-    intensity_weight: FloatArray,
-    table: FloatArray,
-    sampling_weight: FloatArray,
-) -> None:
-    """Write each subsegment's sampling weight (C,), reduced in long or curved components."""
+def _write_sampling_weights(found: Subsegments, component: IntArray, table: FloatArray) -> None:
+    """Write each subsegment's sampling weight, reduced in long or curved components."""
     shapes = ComponentShapes(table[0], table[1], table[2], table[3], table[4], table[5])
     # Components with fewer search lines are specks, and do not count for the typical length.
     speck_lines = 3.0
@@ -320,15 +293,13 @@ def _write_sampling_weights(
     weight_limit_share = 2.0
     min_weight_limit = 16.0
     most_lines = max(weight_limit_share * typical, min_weight_limit)
-    begin = 0
     # Factor on the sampling weight of a curved component: any tangent plane fits a part of a fish.
-    curved_weight = 0.2
-    for c in range(n_lines.shape[0]):
+    curved_weight, begin = 0.2, 0
+    for c in range(found.laser.shape[0]):
         s = component[begin]
-        sampling_weight[c] = intensity_weight[c] * min(1.0, most_lines / shapes.n_lines[s])
-        if is_curved(shapes, s):
-            sampling_weight[c] *= curved_weight
-        begin += n_lines[c]
+        weight = found.intensity_weight[c] * min(1.0, most_lines / shapes.n_lines[s])
+        found.table[6, c] = curved_weight * weight if is_curved(shapes, s) else weight
+        begin += found.n_lines[c]
 
 
 # Marks of a cell: light in a neighbouring cell, or in the cell itself.
@@ -345,29 +316,24 @@ def _cell(coordinate: float) -> int:
     return (int(max(coordinate, 0.0)) * _SIXTH >> _SIXTH_BITS) + 1
 
 
+class Cells(NamedTuple):
+    """Cells of the image, numbered row by row."""
+
+    of_candidate: IntArray  # Shape (N,): number of the cell in which each candidate lies.
+    n: int  # In total.
+    n_columns: int  # In a row.
+
+
 @inner_kernel
-def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
-    """Write the number of the cell in which each of N candidates lies.
-
-    Parameters
-    ----------
-    pixels : array, shape (N, 2)
-        In `image`.
-    cell : int array, shape (N,)
-        Written.
-
-    Returns
-    -------
-    n_cells, n_columns : int
-        Cells in total, and in a row; cells are numbered row by row.
-    """
+def number_cells(pixels: FloatArray) -> Cells:
+    """Return the cells of candidates whose pixels (N, 2) in `image` are given."""
     right, low = 0.0, 0.0
     for i in range(pixels.shape[0]):
         right, low = max(right, pixels[i, 0]), max(low, pixels[i, 1])
-    n_columns = _cell(right) + 2
+    n_columns, cell = _cell(right) + 2, np.empty(pixels.shape[0], np.int64)
     for i in range(pixels.shape[0]):
         cell[i] = _cell(pixels[i, 1]) * n_columns + _cell(pixels[i, 0])
-    return (_cell(low) + 2) * n_columns, n_columns
+    return Cells(cell, (_cell(low) + 2) * n_columns, n_columns)
 
 
 @inline_borrowing_kernel
@@ -382,12 +348,12 @@ def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
 
 
 @inner_kernel
-def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
+def lit_cells(cells: Cells, explained: BoolArray) -> U8Array:
     """Mark the cells with explained candidates, and those around them.
 
     Parameters
     ----------
-    cell, n_cells, n_columns
+    cells : Cells
         From `number_cells`.
     explained : bool array, shape (N,)
         Candidates that lie on a surface.
@@ -397,10 +363,10 @@ def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int
     uint8 array, shape (n_cells,)
         Nonzero in marked cells.
     """
-    lit = np.zeros(n_cells, np.uint8)
-    for i in range(cell.shape[0]):
+    lit = np.zeros(cells.n, np.uint8)
+    for i in range(explained.shape[0]):
         if explained[i]:
-            mark_cells(cell[i], n_columns, lit)
+            mark_cells(cells.of_candidate[i], cells.n_columns, lit)
     return lit
 
 
@@ -444,10 +410,9 @@ def find_candidates(
     n = 0
     for i, (band, found) in enumerate(zip(laser_bands, by_search, strict=True)):
         n = append_candidates(found, band.lines, i, found is along_x, best_height, n, tables)
-    points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
     pixels, numbers = tables.pixels[:n], tables.numbers[:, :n]
-    all_valid = triangulator.triangulate_into(
-        pixels, numbers[ALONG_X], numbers[LASER], numbers[SUBSEGMENT], points, sensitivity, valid
+    points, sensitivity, valid, all_valid = triangulator.triangulate(
+        pixels, numbers[ALONG_X], numbers[LASER], numbers[SUBSEGMENT]
     )
     # The rows of the tables are in the order of the fields.
     measures = tables.measures[:, :n]

@@ -211,13 +211,11 @@ def label_loose(
 @inner_kernel
 def _list_kept(source: IntArray, pixels: FloatArray, explained: BoolArray, rows: IntArray) -> int:
     """Write the explained candidates and those in no cell of one; return their number."""
-    cell = np.empty(source.shape[0], np.int64)
-    n_cells, n_columns = number_cells(pixels, cell)
-    lit = lit_cells(cell, explained, n_cells, n_columns)
-    n = 0
+    cells, n = number_cells(pixels), 0
+    lit = lit_cells(cells, explained)
     for i in range(source.shape[0]):
         rows[n] = i
-        n += explained[i] or lit[cell[i]] == 0
+        n += explained[i] or lit[cells.of_candidate[i]] == 0
     return n
 
 

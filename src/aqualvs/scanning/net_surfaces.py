@@ -10,7 +10,6 @@ the difference from another posture to the covariance of a posture.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -337,6 +336,8 @@ def _difference(posture: Posture, other: Posture) -> FloatArray:
     )
 
 
+MIN_LINES_PER_LASER = 8
+"""Least number of search lines with which a laser supports a surface."""
 # Largest duty of gappy stripes, as on a dense net or a wall in a net's shadows; above it the gaps
 # are specks. The duty is a typical lit interval over the sum of it and a typical gap.
 _GAPPY_DUTY = 0.9
@@ -354,31 +355,11 @@ LONGEST_INTERVAL = 0.03
 _UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
 
 
-class StripePattern(NamedTuple):
-    """Pattern of lit intervals and gaps of the stripes on a surface."""
-
-    # As on a net: two lasers (or the only one with enough lines) have short lit intervals between
-    # longer gaps. One laser may run along a strand and be unbroken even on a net. If little is
-    # visible, a few short intervals and no long ones are enough.
-    is_mesh: bool
-    # As on a dense net, or on a wall in the shadows of a net: short intervals between any gaps.
-    is_gappy: bool
-    # As on something solid, perhaps with gaps: on two lasers (or the only one with enough lines)
-    # many search lines are in intervals longer than those on strands.
-    is_unbroken: bool
-    # Number of lit intervals of the stripes that are broken as on a net.
-    n_strands: int
-    # Search lines from end to end of the gappy stripes, summed over the lasers.
-    extent: float
-    # Shape (n_lasers,): intensity weight in intervals as short or as narrow as those on strands,
-    # not curved.
-    on_strands: FloatArray
-
-
+@lazy_kernel
 def describe_pattern(
-    subsegments: Subsegments, members: BoolArray, n_lasers: int, min_lines: int, focal_px: float
-) -> StripePattern:
-    """Describe the stripes on a surface.
+    subsegments: Subsegments, members: BoolArray, focal_px: float, on_strands: FloatArray
+) -> tuple[bool, bool, bool, int, float]:
+    """Describe the pattern of lit intervals and gaps of the stripes on a surface.
 
     Parameters
     ----------
@@ -386,32 +367,28 @@ def describe_pattern(
         C of them.
     members : bool array, shape (C,)
         Those on the surface.
-    n_lasers : int
-        Lasers of the rig.
-    min_lines : int
-        Lasers with fewer search lines on the surface do not count.
     focal_px : float
         Pixels per radian, roughly.
+    on_strands : array, shape (n_lasers,)
+        Written: intensity weight in intervals as short or as narrow as those on strands, not
+        curved; 0 at first.
 
     Returns
     -------
-    StripePattern
+    is_mesh : bool
+        As on a net: two lasers (or the only one with enough lines) have short lit intervals between
+        longer gaps. One laser may run along a strand and be unbroken even on a net. If little is
+        visible, a few short intervals and no long ones are enough.
+    is_gappy : bool
+        As on a dense net, or on a wall in the shadows of a net: short intervals between any gaps.
+    is_unbroken : bool
+        As on something solid, perhaps with gaps: on two lasers (or the only one with enough lines)
+        many search lines are in intervals longer than those on strands.
+    n_strands : int
+        Number of lit intervals of the stripes that are broken as on a net.
+    extent : float
+        Search lines from end to end of the gappy stripes, summed over the lasers.
     """
-    on_strands = np.zeros(n_lasers)
-    return StripePattern(
-        *_describe(subsegments, members, min_lines, focal_px, on_strands), on_strands
-    )
-
-
-@lazy_kernel
-def _describe(
-    subsegments: Subsegments,
-    members: BoolArray,
-    min_lines: int,
-    focal_px: float,
-    on_strands: FloatArray,
-) -> tuple[bool, bool, bool, int, float]:
-    """Write the intensity weight on strands (n_lasers,); return the rest of a `StripePattern`."""
     asked, broken, gappy, long, unbroken, n_intervals = 0, 0, 0, 0, 0, 0
     total, n_strands = 0.0, 0
     # Largest duty of a mesh. The gaps of a net are longer than the lit strands; a wall behind a net
@@ -419,7 +396,7 @@ def _describe(
     mesh_duty = 0.6
     for index in range(on_strands.shape[0]):
         order, n_mine = _in_order(subsegments, members, index)
-        if n_mine < min_lines:
+        if n_mine < MIN_LINES_PER_LASER:
             continue
         asked += 1
         n, duty, length, extent, on_strands[index], share = _describe_stripe(

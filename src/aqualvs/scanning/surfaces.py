@@ -22,8 +22,17 @@ from aqualvs.geometry.compiled import (
 )
 from aqualvs.geometry.linear_algebra import flatnonzero, n_bins, sum_of
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Subsegments, mark_cells, number_cells
+from aqualvs.optics.rig import Rig
+from aqualvs.scanning.candidates import (
+    Cells,
+    LinkedCandidates,
+    Subsegments,
+    mark_cells,
+    number_cells,
+)
+from aqualvs.scanning.laser_bands import search_range
 from aqualvs.scanning.net_surfaces import (
+    MIN_LINES_PER_LASER,
     describe_pattern,
     is_continuation,
     merged_plane,
@@ -45,8 +54,6 @@ from aqualvs.scanning.plane_search import (
 
 MAX_SURFACES = 5
 """Largest number of surfaces in a frame."""
-MIN_LINES_PER_LASER = 8
-"""Least number of search lines with which a laser supports a surface."""
 _MIN_LINES = 30  # Least number of search lines of a surface.
 WORTH_SHARE = 0.08
 """Least search lines and sampling weight of a surface, as a share of the best one's; less is what
@@ -105,7 +112,7 @@ def search_surfaces(
 
 
 @lazy_kernel
-def search_before(
+def _search_before(
     search: SurfaceSearch,
     others: BoolArray,
     behind: FloatArray,
@@ -115,19 +122,11 @@ def search_before(
 ) -> bool:
     """Find a plane with most of the light in front of another one that no surface explains.
 
-    Parameters
-    ----------
-    search : SurfaceSearch
-    others : bool array, shape (C,)
-        Subsegments on any surface.
-    behind : array, shape (4,)
-        Normal and offset of the other plane.
-    plane, members, sums
-        Written: one row each of what `search_surfaces` writes; `members` is False at first.
+    `others` (C,) are the subsegments on any surface, `behind` (4,) is the other plane. Writes one
+    row each of what `search_surfaces` writes; `members` is False at first.
     """
-    cell, free = np.empty(search.pixels.shape[0], np.int64), np.full(others.shape[0], True)
-    n_cells, n_columns = number_cells(search.pixels, cell)
-    _claim_peaks(search.subsegments.of_candidate, cell, n_cells, n_columns, others, free)
+    free = np.full(others.shape[0], True)
+    _claim_peaks(search.subsegments.of_candidate, number_cells(search.pixels), others, free)
     return bool(_find_before(search, free, behind, free.shape[0], plane, members, sums))
 
 
@@ -158,19 +157,18 @@ def _find_before(
     _collect_inliers(subsegments, rows, plane, members, by_laser)
     if not _sum_lasers(by_laser, sums):
         return False
-    cell = np.empty(search.pixels.shape[0], np.int64)
-    n_cells, n_columns = number_cells(search.pixels, cell)
-    _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, members, before)
-    left = _light_once(subsegments.of_candidate, cell, n_cells, before, weight)
+    cells = number_cells(search.pixels)
+    _claim_peaks(subsegments.of_candidate, cells, members, before)
+    left = _light_once(subsegments.of_candidate, cells, before, weight)
     return bool(sums[SAMPLING_WEIGHT] > left)
 
 
 @inner_kernel
 def _light_once(
-    subsegment_index: IntArray, cell: IntArray, n_cells: int, some: BoolArray, weight: FloatArray
+    subsegment_index: IntArray, cells: Cells, some: BoolArray, weight: FloatArray
 ) -> float:
     """Return the weight of some subsegments, light that several of them share counted once."""
-    is_lit = np.zeros(n_cells, np.bool_)
+    is_lit, cell = np.zeros(cells.n, np.bool_), cells.of_candidate
     n, n_lit = np.zeros(some.shape[0], np.int64), np.zeros(some.shape[0], np.int64)
     for i in range(subsegment_index.shape[0]):
         c = subsegment_index[i]
@@ -206,8 +204,6 @@ def _search_all(
     `search_surfaces`.
     """
     subsegments = search.subsegments
-    cell = np.empty(search.pixels.shape[0], np.int64)
-    n_cells, n_columns = 0, 0
     enough = float(_MIN_LINES)
     min_subsegments = 6
     # Least intensity weight, as a share of that of all candidates; planes through noise have up to
@@ -237,9 +233,9 @@ def _search_all(
             mine[:] = False
             continue
         enough = max(enough, WORTH_SHARE * sums[found, LINES])
-        if n_cells == 0:
-            n_cells, n_columns = number_cells(search.pixels, cell)
-        _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, mine, free)
+        if found == 0:
+            cells = number_cells(search.pixels)
+        _claim_peaks(subsegments.of_candidate, cells, mine, free)
         found += 1
     return MAX_SURFACES
 
@@ -315,24 +311,10 @@ def _sum_lasers(by_laser: FloatArray, sums: FloatArray) -> bool:
 
 
 @lazy_kernel
-def collect_surface(
+def _collect_surface(
     subsegments: Subsegments, n_lasers: int, plane: FloatArray, members: BoolArray, sums: FloatArray
 ) -> None:
-    """Mark the subsegments on a plane; write the sums of its surface as `search_surfaces` does.
-
-    Parameters
-    ----------
-    subsegments : Subsegments
-        C of them.
-    n_lasers : int
-        Lasers of the rig.
-    plane : array, shape (4,)
-        Normal and offset.
-    members : bool array, shape (C,)
-        Written where True; False at first.
-    sums : array, shape (3,)
-        Written: search lines, intensity weight and sampling weight.
-    """
+    """Mark the subsegments on a plane (4,), and write the sums of its surface (3,)."""
     by_laser = np.zeros((3, n_lasers))
     rows = np.arange(subsegments.laser.shape[0])
     _collect_inliers(subsegments, rows, plane, members, by_laser)
@@ -340,31 +322,17 @@ def collect_surface(
 
 
 @lazy_kernel
-def collect_left_over(
-    subsegments: Subsegments,
-    pixels: FloatArray,
-    n_lasers: int,
-    others: BoolArray,
-    members: BoolArray,
-    sums: FloatArray,
+def _collect_left_over(
+    search: SurfaceSearch, others: BoolArray, members: BoolArray, sums: FloatArray
 ) -> bool:
     """Remove another surface's light from a surface; return whether enough is left of it.
 
-    Parameters
-    ----------
-    subsegments, pixels, n_lasers
-        As in `SurfaceSearch`.
-    others : bool array, shape (C,)
-        Subsegments on the other surface.
-    members : bool array, shape (C,)
-        Subsegments on the surface; False is written where their light is the other's.
-    sums : array, shape (3,)
-        Written, as in `collect_surface`.
+    Writes False to `members` (C,) where their light is that of the other surface's subsegments,
+    `others` (C,); and the sums of the rest (3,).
     """
-    cell = np.empty(pixels.shape[0], np.int64)
-    n_cells, n_columns = number_cells(pixels, cell)
-    _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, others, members)
-    by_laser = np.zeros((3, n_lasers))
+    subsegments = search.subsegments
+    _claim_peaks(subsegments.of_candidate, number_cells(search.pixels), others, members)
+    by_laser = np.zeros((3, search.n_lasers))
     for c in range(members.shape[0]):
         if members[c]:
             _add_subsegment(subsegments, c, by_laser)
@@ -387,18 +355,13 @@ def limited_sum(weight: FloatArray) -> float:
 
 @inner_kernel
 def _claim_peaks(
-    subsegment_index: IntArray,
-    cell: IntArray,
-    n_cells: int,
-    n_columns: int,
-    members: BoolArray,
-    free: BoolArray,
+    subsegment_index: IntArray, cells: Cells, members: BoolArray, free: BoolArray
 ) -> None:
     """Remove the members, and subsegments mostly of the same light, from the free ones (C,)."""
-    lit = np.zeros(n_cells, np.uint8)
+    lit, cell = np.zeros(cells.n, np.uint8), cells.of_candidate
     for i in range(subsegment_index.shape[0]):
         if members[subsegment_index[i]]:
-            mark_cells(cell[i], n_columns, lit)
+            mark_cells(cell[i], cells.n_columns, lit)
     claimed = np.zeros(free.shape[0], np.int64)
     for i in range(subsegment_index.shape[0]):
         claimed[subsegment_index[i]] += 1 if lit[cell[i]] else -1
@@ -424,7 +387,7 @@ class Surface:
     sampling_weight: float
     # Search lines from end to end of its gappy stripes, summed over the lasers, without stragglers.
     extent: float
-    # Pattern of its stripes, as in `StripePattern`: as on a net; with gaps at least, as on a dense
+    # Pattern of its stripes (`describe_pattern`): as on a net; with gaps at least, as on a dense
     # net or in a net's shadows; and with long lit intervals, as on a table with gaps.
     is_mesh: bool
     is_gappy: bool = False
@@ -434,132 +397,124 @@ class Surface:
     n_planes: int = 1
 
 
-def find_surfaces(
-    subsegments: Subsegments,
-    pixels: FloatArray,
-    n_lasers: int,
-    working_range: tuple[float, float],
-    focal_px: float,
-) -> list[Surface]:
-    """Find the planes in a frame, best supported first.
+class SurfaceFinder:
+    """Finder of surfaces in the frames of one rig.
 
     Parameters
     ----------
-    subsegments : Subsegments
-        Of all candidates.
-    pixels : array, shape (N, 2)
-        Each candidate's place in the image.
-    n_lasers : int
-        Lasers of the rig.
-    working_range : (float, float)
-        Limits of the planes that are considered, in metres.
-    focal_px : float
-        Pixels per radian, roughly: turns search lines into lengths on the surface.
-
-    Returns
-    -------
-    list of Surface
-        Deterministic: the same subsegments give the same surfaces.
+    rig : Rig
+        Lasers, working range, and focal length, which turns search lines into lengths.
     """
-    planes, sums = np.empty((MAX_SURFACES, 4)), np.empty((MAX_SURFACES, 3))
-    members = np.zeros((MAX_SURFACES, subsegments.n), np.bool_)
-    search = SurfaceSearch(subsegments, pixels, n_lasers, *working_range)
-    n = search_surfaces(search, planes, members, sums)
-    surfaces = [
-        _describe(subsegments, planes[i], members[i], sums[i], n_lasers, focal_px) for i in range(n)
-    ]
-    if n < 2:
-        return surfaces
-    classified = [
-        replace(one, is_mesh=True) if _is_dense_net(one, surfaces, subsegments) else one
-        for one in surfaces
-    ]
-    return _merge_coplanar(classified, subsegments)
 
+    def __init__(self, rig: Rig) -> None:
+        self._n_lasers, self._focal_px = len(rig.lasers), rig.focal_px
+        self._limits = search_range(rig.working_range)
 
-def find_before(
-    target: Surface,
-    surfaces: Sequence[Surface],
-    subsegments: Subsegments,
-    pixels: FloatArray,
-    working_range: tuple[float, float],
-    n_lasers: int,
-    focal_px: float,
-) -> Surface | None:
-    """Find a surface in front of another one that has most of the light left there.
+    def find(self, linked: LinkedCandidates) -> list[Surface]:
+        """Find the planes in a frame, best supported first.
 
-    A peak has a candidate for each laser of a fan, so that a net before a wall has a small share of
-    all candidates, and is found only once the wall's peaks are set aside.
+        Deterministic: the same candidates give the same surfaces.
+        """
+        candidates, subsegments, _ = linked
+        planes, sums = np.empty((MAX_SURFACES, 4)), np.empty((MAX_SURFACES, 3))
+        members = np.zeros((MAX_SURFACES, subsegments.n), np.bool_)
+        search = SurfaceSearch(subsegments, candidates.pixels, self._n_lasers, *self._limits)
+        n = search_surfaces(search, planes, members, sums)
+        surfaces = [self._describe(subsegments, planes[i], members[i], sums[i]) for i in range(n)]
+        if n < 2:
+            return surfaces
+        classified = [
+            replace(one, is_mesh=True) if _is_dense_net(one, surfaces, subsegments) else one
+            for one in surfaces
+        ]
+        return _merge_coplanar(classified, subsegments)
 
-    Parameters
-    ----------
-    target : Surface
-        The surface behind.
-    surfaces : sequence of Surface
-        All surfaces found; their light is set aside.
-    subsegments, pixels, working_range, n_lasers, focal_px
-        As in `find_surfaces`.
+    def find_before(
+        self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
+    ) -> Surface | None:
+        """Find a surface in front of another one that has most of the light left there.
 
-    Returns
-    -------
-    Surface or None
-        None unless it has a twentieth of the light of the surface behind, and stripes about as
-        narrow.
-    """
-    # Specks before a wall make planes by chance, with little light. Peaks that are this many times
-    # as wide as its stripes are its texture.
-    least_share, widest = 0.05, 2.5
-    search = SurfaceSearch(subsegments, pixels, n_lasers, *working_range)
-    plane, members, sums = np.empty(4), np.zeros(subsegments.n, np.bool_), np.zeros(3)
-    others = np.any([one.members for one in surfaces], axis=0)
-    if not search_before(search, others, target.plane.packed(), plane, members, sums):
-        return None
-    width = subsegments.width
-    if np.mean(width[members]) > widest * np.mean(width[target.members]):
-        return None
-    if sums[INLIER_WEIGHT] < least_share * target.inlier_weight:
-        return None
-    return _describe(subsegments, plane, members, sums, n_lasers, focal_px)
+        A peak has a candidate for each laser of a fan, so that a net before a wall has a small
+        share of all candidates, and is found only once the wall's peaks are set aside.
 
+        Parameters
+        ----------
+        linked : LinkedCandidates
+            Of the frame.
+        surfaces : sequence of Surface
+            All surfaces found; their light is set aside.
+        target : Surface
+            The surface behind.
 
-def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: float) -> Surface:
-    """Return the surface of all subsegments on a plane, even if other surfaces explain their light.
+        Returns
+        -------
+        Surface or None
+            None unless it has a twentieth of the light of the surface behind, and stripes about as
+            narrow.
+        """
+        # Specks before a wall make planes by chance, with little light. Peaks that are this many
+        # times as wide as its stripes are its texture.
+        least_share, widest = 0.05, 2.5
+        candidates, subsegments, _ = linked
+        search = SurfaceSearch(subsegments, candidates.pixels, self._n_lasers, *self._limits)
+        plane, members, sums = np.empty(4), np.zeros(subsegments.n, np.bool_), np.zeros(3)
+        others = np.any([one.members for one in surfaces], axis=0)
+        if not _search_before(search, others, target.plane.packed(), plane, members, sums):
+            return None
+        width = subsegments.width
+        if np.mean(width[members]) > widest * np.mean(width[target.members]):
+            return None
+        if sums[INLIER_WEIGHT] < least_share * target.inlier_weight:
+            return None
+        return self._describe(subsegments, plane, members, sums)
 
-    Parameters
-    ----------
-    plane : Plane
-        In `dome`, offset > 0.
-    subsegments, n_lasers, focal_px
-        As in `find_surfaces`.
-    """
-    packed, members = plane.packed(), np.zeros(subsegments.n, np.bool_)
-    sums = np.empty(3)
-    collect_surface(subsegments, n_lasers, packed, members, sums)
-    return _describe(subsegments, packed, members, sums, n_lasers, focal_px)
+    def on_plane(self, subsegments: Subsegments, plane: Plane) -> Surface:
+        """Return the surface of all subsegments on a plane, whatever other surfaces explain."""
+        packed, members, sums = plane.packed(), np.zeros(subsegments.n, np.bool_), np.empty(3)
+        _collect_surface(subsegments, self._n_lasers, packed, members, sums)
+        return self._describe(subsegments, packed, members, sums)
 
+    def left_over(self, linked: LinkedCandidates, one: Surface, other: Surface) -> Surface | None:
+        """Return a surface without another one's light; None if that leaves too little of it."""
+        candidates, subsegments, _ = linked
+        members, sums = one.members.copy(), np.empty(3)
+        search = SurfaceSearch(subsegments, candidates.pixels, self._n_lasers, *self._limits)
+        if not _collect_left_over(search, other.members, members, sums):
+            return None
+        return self._describe(subsegments, one.plane.packed(), members, sums)
 
-def left_over(
-    one: Surface,
-    other: Surface,
-    subsegments: Subsegments,
-    pixels: FloatArray,
-    n_lasers: int,
-    focal_px: float,
-) -> Surface | None:
-    """Return a surface without another one's light; None if that leaves too little of it.
-
-    Parameters
-    ----------
-    one, other : Surface
-        The surface, and the one whose light it loses.
-    subsegments, pixels, n_lasers, focal_px
-        As in `find_surfaces`.
-    """
-    members, sums = one.members.copy(), np.empty(3)
-    if not collect_left_over(subsegments, pixels, n_lasers, other.members, members, sums):
-        return None
-    plane = one.plane.packed()
-    return _describe(subsegments, plane, members, sums, n_lasers, focal_px)
+    def _describe(
+        self, subsegments: Subsegments, plane: FloatArray, members: BoolArray, sums: FloatArray
+    ) -> Surface:
+        """Make a surface from a plane (4,), its subsegments and their sums."""
+        lines, inlier_weight, sampling_weight = sums.tolist()
+        light, on_strands = np.zeros((2, self._n_lasers))
+        is_mesh, is_gappy, is_unbroken, n_strands, extent = describe_pattern(
+            subsegments, members, self._focal_px, on_strands
+        )
+        np.add.at(light, subsegments.laser[members], subsegments.intensity_weight[members])
+        # Least share of a net's light on strands; a fish has more in long or bent components. Where
+        # each laser lights many strands, long components lie along others, and so do whole stripes.
+        least, many, share_of_many = 0.4, 6, 0.2
+        brightest, along = light.argmax(), on_strands <= 0.1 * light
+        if is_mesh and n_strands >= many * self._n_lasers:
+            light[along], least = 0.0, share_of_many
+        elif is_mesh and on_strands[brightest] == 0.0:
+            light[brightest] = 0.0
+        # Near the vehicle, strands are long in search lines, and limited in sampling weight.
+        weight = max(sampling_weight, limited_sum(on_strands))
+        may_be_net = weight > least * limited_sum(light)
+        return Surface(
+            plane=Plane(plane[:3], float(plane[3])),
+            members=members,
+            n_lines=int(lines),
+            inlier_weight=inlier_weight,
+            sampling_weight=sampling_weight,
+            extent=extent,
+            is_mesh=is_mesh and may_be_net,
+            is_gappy=is_gappy and may_be_net,
+            is_unbroken=is_unbroken,
+        )
 
 
 def shares_peaks(one: Surface, other: Surface, subsegments: Subsegments) -> bool:
@@ -605,42 +560,6 @@ def _is_apart(one: Surface, net: Surface, subsegments: Subsegments) -> bool:
     off = np.abs(plane.normal @ table[X : Z + 1] - plane.offset)
     far = off > deepest * plane.offset
     return bool(table[WEIGHT, far].sum() > 0.5 * table[WEIGHT].sum())
-
-
-def _describe(
-    subsegments: Subsegments,
-    plane: FloatArray,
-    members: BoolArray,
-    sums: FloatArray,
-    n_lasers: int,
-    focal_px: float,
-) -> Surface:
-    """Make a surface from a plane (4,), its subsegments and their sums."""
-    lines, inlier_weight, sampling_weight = sums.tolist()
-    pattern = describe_pattern(subsegments, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
-    light = np.zeros(n_lasers)
-    np.add.at(light, subsegments.laser[members], subsegments.intensity_weight[members])
-    # Least share of a net's light on strands; a fish has more in long or bent components. Where
-    # each laser lights many strands, long components lie along others, and so do whole stripes.
-    least, many, share_of_many = 0.4, 6, 0.2
-    brightest, along = light.argmax(), pattern.on_strands <= 0.1 * light
-    if pattern.is_mesh and pattern.n_strands >= many * n_lasers:
-        light[along], least = 0.0, share_of_many
-    elif pattern.is_mesh and pattern.on_strands[brightest] == 0.0:
-        light[brightest] = 0.0
-    # Near the vehicle, strands are long in search lines, and limited in sampling weight.
-    on_strands = max(sampling_weight, limited_sum(pattern.on_strands)) > least * limited_sum(light)
-    return Surface(
-        plane=Plane(plane[:3], float(plane[3])),
-        members=members,
-        n_lines=int(lines),
-        inlier_weight=inlier_weight,
-        sampling_weight=sampling_weight,
-        extent=pattern.extent,
-        is_mesh=pattern.is_mesh and on_strands,
-        is_gappy=pattern.is_gappy and on_strands,
-        is_unbroken=pattern.is_unbroken,
-    )
 
 
 def _merge_coplanar(surfaces: list[Surface], subsegments: Subsegments) -> list[Surface]:

@@ -11,18 +11,10 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, AssignmentTest, Verdict
 from aqualvs.scanning.candidates import Candidates, LinkedCandidates, Subsegments
-from aqualvs.scanning.laser_bands import search_range
+from aqualvs.scanning.net_surfaces import MIN_LINES_PER_LASER
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, Measurement
-from aqualvs.scanning.surfaces import (
-    MIN_LINES_PER_LASER,
-    WORTH_SHARE,
-    Surface,
-    find_before,
-    left_over,
-    shares_peaks,
-    surface_on,
-)
+from aqualvs.scanning.surfaces import WORTH_SHARE, Surface, SurfaceFinder, shares_peaks
 
 
 class TargetKind(StrEnum):
@@ -61,7 +53,7 @@ def choose_target(
     Parameters
     ----------
     surfaces : sequence of Surface
-        From `find_surfaces`.
+        From `SurfaceFinder.find`.
     kind : TargetKind
         Kind of the target.
     working_range : (float, float)
@@ -139,18 +131,21 @@ class TargetSelector:
     Parameters
     ----------
     rig : Rig
-        Lasers, focal length and working range.
+        Focal length and working range.
     kind : TargetKind
         Kind of the target.
     assignment : AssignmentTest
         Of the same rig.
+    finder : SurfaceFinder
+        Of the same rig.
     """
 
-    def __init__(self, rig: Rig, kind: TargetKind, assignment: AssignmentTest) -> None:
-        self._kind, self._assignment = kind, assignment
-        self._working_range = rig.working_range
+    def __init__(
+        self, rig: Rig, kind: TargetKind, assignment: AssignmentTest, finder: SurfaceFinder
+    ) -> None:
+        self._kind, self._assignment, self._finder = kind, assignment, finder
+        self._working_range, self._focal_px = rig.working_range, rig.focal_px
         self.has_fan = bool(assignment.fans)
-        self._n_lasers, self._focal_px = len(rig.lasers), rig.focal_px
 
     def choose(self, linked: LinkedCandidates, surfaces: list[Surface]) -> TargetChoice:
         """Choose the target, and test whether other lasers explain its peaks as well.
@@ -289,11 +284,8 @@ class TargetSelector:
         It replaces something solid if all light on its plane, also that which the solid surface
         explains, shows most lasers. False edges make meshes, too, but of few lasers.
         """
-        subsegments, pixels = linked.subsegments, linked.candidates.pixels
-        of_rig = (self._n_lasers, self._focal_px)
-        before = find_before(
-            target, surfaces, subsegments, pixels, search_range(self._working_range), *of_rig
-        )
+        subsegments = linked.subsegments
+        before = self._finder.find_before(linked, surfaces, target)
         if before is None or not before.is_mesh:
             return surfaces, target
         if target.is_mesh:
@@ -301,7 +293,7 @@ class TargetSelector:
         # Its light may have been read as the next lasers'.
         verdict, other, _ = self._assignment.test(linked, before)
         plane = before.plane if other is None or verdict is not Verdict.RIVAL else other
-        whole = surface_on(plane, subsegments, *of_rig)
+        whole = self._finder.on_plane(subsegments, plane)
         if self._assignment.is_faint(whole, subsegments):
             return surfaces, target
         return [*surfaces, before], before
@@ -329,9 +321,9 @@ class TargetSelector:
 
         A net before the rival remains with the light that is not the rival's.
         """
-        subsegments, of_rig = linked.subsegments, (self._n_lasers, self._focal_px)
-        rival = surface_on(other, subsegments, *of_rig)
-        rest = left_over(target, rival, subsegments, linked.candidates.pixels, *of_rig)
+        subsegments = linked.subsegments
+        rival = self._finder.on_plane(subsegments, other)
+        rest = self._finder.left_over(linked, target, rival)
         kept = [] if rest is None or not rest.is_mesh else [rest]
         kept += [
             one

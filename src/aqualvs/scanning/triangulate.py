@@ -1,6 +1,6 @@
 """Triangulation: pixels on a laser's stripe to points in the water, with their uncertainty."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from aqualvs.optics.sheet import WINDOWED, intersect_ray, packed_sheets, planes_
 _DIFFERENCE_PX = 0.25
 
 
-@dataclass(frozen=True, slots=True)
-class Triangulation:
+class Triangulation(NamedTuple):
     """Points on laser sheets, N of them."""
 
     points_in_dome: FloatArray  # Shape (N, 3): metres; NaN where not valid.
@@ -31,6 +30,7 @@ class Triangulation:
     sensitivity: FloatArray
     # Shape (N,): False where the pixel sees nothing or its ray misses the sheet.
     valid: BoolArray
+    all_valid: bool
 
 
 class Triangulator:
@@ -67,33 +67,15 @@ class Triangulator:
             few pixels of one stripe it hardly changes.
         """
         n = len(pixels)
-        points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
         if group is None:
             group = np.arange(n)
-        self.triangulate_into(pixels, along_x, laser, group, points, sensitivity, valid)
-        return Triangulation(points, sensitivity, valid)
-
-    def triangulate_into(
-        self,
-        pixels: FloatArray,
-        along_x: IntArray,
-        laser: IntArray,
-        group: IntArray,
-        out_points: FloatArray,
-        out_sensitivity: FloatArray,
-        out_valid: BoolArray,
-    ) -> bool:
-        """Write the fields of a `Triangulation`; return whether all points are valid.
-
-        Arguments as of `triangulate`.
-        """
-        n = len(pixels)
         rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
         n_rays = _place_rays(pixels, along_x, group, rays_px, owner)
         origins, directions = np.empty((2, n_rays, 3))
         seen = np.empty(n_rays, np.bool_)
         rays_all(self._camera.params, rays_px[:n_rays], origins, directions, seen)
-        all_valid: bool = _intersect(
+        points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
+        all_valid = _intersect(
             self.planes,
             self._bent,
             laser,
@@ -101,11 +83,11 @@ class Triangulator:
             origins,
             directions,
             seen,
-            out_points,
-            out_sensitivity,
-            out_valid,
+            points,
+            sensitivity,
+            valid,
         )
-        return all_valid
+        return Triangulation(points, sensitivity, valid, all_valid)
 
 
 @borrowing_kernel
@@ -121,8 +103,31 @@ def _intersect(
     sensitivity: FloatArray,
     valid: BoolArray,
 ) -> bool:
-    """Intersect the rays with the sheets; return whether all points are valid."""
-    _intersect_planes(planes, laser, owner, origins, directions, seen, points, sensitivity, valid)
+    """Intersect the rays with n·X = d (Eq. 20) or bent sheets; return whether all points are valid.
+
+    The moved ray of each group gives the sensitivity of its points.
+    """
+    sx, sy, sz = np.nan, np.nan, np.nan
+    for i in range(points.shape[0]):
+        plane = laser[i]
+        reach = _distance_to_sheet(origins, directions, i, planes, plane)
+        hit = seen[i] and 0.0 < reach < np.inf
+        x = origins[i, 0] + reach * directions[i, 0] if hit else np.nan
+        y = origins[i, 1] + reach * directions[i, 1] if hit else np.nan
+        z = origins[i, 2] + reach * directions[i, 2] if hit else np.nan
+        j = owner[i]
+        if i == 0 or j != owner[i - 1]:
+            moved = _distance_to_sheet(origins, directions, j, planes, plane)
+            moved = moved if seen[j] and 0.0 < moved < np.inf else np.nan
+            sx = (origins[j, 0] + moved * directions[j, 0] - x) / _DIFFERENCE_PX
+            sy = (origins[j, 1] + moved * directions[j, 1] - y) / _DIFFERENCE_PX
+            sz = (origins[j, 2] + moved * directions[j, 2] - z) / _DIFFERENCE_PX
+        known = hit and sx == sx
+        valid[i] = known
+        points[i, 0] = x if known else np.nan
+        points[i, 1] = y if known else np.nan
+        points[i, 2] = z if known else np.nan
+        sensitivity[i, 0], sensitivity[i, 1], sensitivity[i, 2] = sx, sy, sz
     if bent is not None:
         _intersect_bent_sheets(
             bent, laser, owner, origins, directions, seen, points, sensitivity, valid
@@ -153,42 +158,6 @@ def _place_rays(
             n_rays += 1
         owner[i] = n_rays - 1
     return int(n_rays)
-
-
-@inner_borrowing_kernel
-def _intersect_planes(
-    planes: FloatArray,
-    laser: IntArray,
-    owner: IntArray,
-    origins: FloatArray,
-    directions: FloatArray,
-    seen: BoolArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    valid: BoolArray,
-) -> None:
-    """Intersect the rays with n·X = d (Eq. 20), and those moved of the first of each group."""
-    sx, sy, sz = np.nan, np.nan, np.nan
-    for i in range(points.shape[0]):
-        plane = laser[i]
-        reach = _distance_to_sheet(origins, directions, i, planes, plane)
-        hit = seen[i] and 0.0 < reach < np.inf
-        x = origins[i, 0] + reach * directions[i, 0] if hit else np.nan
-        y = origins[i, 1] + reach * directions[i, 1] if hit else np.nan
-        z = origins[i, 2] + reach * directions[i, 2] if hit else np.nan
-        j = owner[i]
-        if i == 0 or j != owner[i - 1]:
-            moved = _distance_to_sheet(origins, directions, j, planes, plane)
-            moved = moved if seen[j] and 0.0 < moved < np.inf else np.nan
-            sx = (origins[j, 0] + moved * directions[j, 0] - x) / _DIFFERENCE_PX
-            sy = (origins[j, 1] + moved * directions[j, 1] - y) / _DIFFERENCE_PX
-            sz = (origins[j, 2] + moved * directions[j, 2] - z) / _DIFFERENCE_PX
-        known = hit and sx == sx
-        valid[i] = known
-        points[i, 0] = x if known else np.nan
-        points[i, 1] = y if known else np.nan
-        points[i, 2] = z if known else np.nan
-        sensitivity[i, 0], sensitivity[i, 1], sensitivity[i, 2] = sx, sy, sz
 
 
 @inline_borrowing_kernel
