@@ -300,17 +300,6 @@ def laser_likelihood(
     return likelihood
 
 
-def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
-    """Return the height in grey levels below which hardly any peak is clearly laser light.
-
-    Parameters
-    ----------
-    height, likelihood : array, shape (N,)
-        Of a sample of peaks.
-    """
-    return int(_useful_height(height, likelihood))
-
-
 @inline_kernel
 def _height_bin(height: float) -> int:
     return int(_BIN_OF_HEIGHT[min(int(height), 255)])
@@ -522,8 +511,14 @@ def _best_stripes(
 
 
 @lazy_kernel
-def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
-    """Return the height (grey levels) from which on a useful number of peaks are clearly lines."""
+def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
+    """Return the height in grey levels below which hardly any peak is clearly laser light.
+
+    Parameters
+    ----------
+    height, likelihood : array, shape (N,)
+        Of a sample of peaks.
+    """
     lines, peaks = np.zeros(_N_BINS), np.zeros(_N_BINS)
     clearly = 0.8  # Likelihood of a clear line.
     for i in range(height.shape[0]):
@@ -537,7 +532,7 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
         all_lines, all_peaks = all_lines + lines[b], all_peaks + peaks[b]
         if _are_useful(lines[b], peaks[b]) and _are_useful(all_lines, all_peaks):
             useful = math.ceil(2.0 ** (b / _BINS_PER_OCTAVE))
-    return float(useful)
+    return useful
 
 
 @inline_kernel
