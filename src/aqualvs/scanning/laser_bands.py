@@ -198,11 +198,8 @@ def _target_normals() -> FloatArray:
 
     They bound the direction of a stripe.
     """
-    tilts = [np.zeros(3)]
-    max_target_tilt = np.deg2rad(45.0)
-    for sign in (-1.0, 1.0):
-        tilts += [np.array([sign * max_target_tilt, 0.0, 0.0])]
-        tilts += [np.array([0.0, 0.0, sign * max_target_tilt])]
+    max_tilt, right, up = np.deg2rad(45.0), np.eye(3)[0], np.eye(3)[2]
+    tilts = (0.0 * up, -max_tilt * right, -max_tilt * up, max_tilt * right, max_tilt * up)
     return np.stack([rotation_from_rotvec(tilt) @ np.array([0.0, 1.0, 0.0]) for tilt in tilts])
 
 
@@ -230,14 +227,13 @@ def _slope_bounds(rise: FloatArray, run: FloatArray) -> tuple[FloatArray, FloatA
     """Return the lowest and highest slope of each cell over all targets; all slopes if unknown."""
     with np.errstate(invalid="ignore", divide="ignore"):
         slopes = rise / run
-    slopes = np.where(np.isfinite(slopes), slopes, np.nan)
-    known = np.isfinite(slopes).any(axis=0)
-    low = np.min(np.where(np.isfinite(slopes), slopes, np.inf), axis=0)
-    high = np.max(np.where(np.isfinite(slopes), slopes, -np.inf), axis=0)
     # Steeper stripes count as parallel to the search line.
     steepest = 5.0
-    low = np.where(known, np.clip(low, -steepest, steepest), -steepest)
-    high = np.where(known, np.clip(high, -steepest, steepest), steepest)
+    known, slopes = np.isfinite(slopes), np.clip(slopes, -steepest, steepest)
+    unknown = ~known.any(axis=0)
+    low = np.min(slopes, axis=0, where=known, initial=steepest)
+    high = np.max(slopes, axis=0, where=known, initial=-steepest)
+    low[unknown], high[unknown] = -steepest, steepest
     return np.ascontiguousarray(low), np.ascontiguousarray(high)
 
 

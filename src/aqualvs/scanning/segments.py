@@ -302,8 +302,7 @@ def link_segments(peaks: StripePeaks, band: LaserBand) -> Segments:
     """
     numbers = np.empty((3, peaks.n), np.int64)
     n = segment_peaks(peaks, band.lines, numbers)
-    order, component, subsegment = numbers[:, :n]
-    return Segments(order, component, subsegment)
+    return Segments(*numbers[:, :n])
 
 
 @inner_kernel

@@ -22,14 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
-from aqualvs.scanning.laser_colour import (
-    RATIO_EXPECTED,
-    RATIO_MIN,
-    WHITE,
-    LaserColour,
-    channel_image,
-    full_size,
-)
+from aqualvs.scanning.laser_colour import RATIO_EXPECTED, RATIO_MIN, WHITE, channel_image, full_size
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.segments import link_segments
 from aqualvs.scanning.stripe import HEIGHT as PEAK_HEIGHT
@@ -132,17 +125,16 @@ class PictureRows(NamedTuple):
     across: Rows
 
 
-def picture_rows(frame: Frame, search: LaserBand, colour: LaserColour) -> PictureRows:
+def picture_rows(frame: Frame, search: LaserBand) -> PictureRows:
     """Return a picture as the rows of a search, its intensity smoothed along the stripes.
 
     Parameters
     ----------
     frame : Frame
     search : LaserBand
-        Of the whole picture.
-    colour : LaserColour
+        Of the whole picture, with the colour of the laser.
     """
-    light = _rows(channel_image(frame, colour), search)
+    light = _rows(channel_image(frame, search.colour), search)
     # In wide pictures, a stripe of a pixel or two is smoothed across as well.
     across = np.array([1.0]) if search.line_px == 1 else np.array([0.25, 0.5, 0.25])
     along = cv2.getGaussianKernel(5, SMOOTHING)
@@ -153,7 +145,7 @@ def picture_rows(frame: Frame, search: LaserBand, colour: LaserColour) -> Pictur
         none = np.empty((0, 0), np.float32)
         return PictureRows(light, none, none)
     u, v = (plane.astype(np.float32) - 128.0 for plane in frame.chroma)
-    to_u, to_v = colour.value
+    to_u, to_v = search.colour.value
     off = (to_u * u + to_v * v, to_u * v - to_v * u)
     return PictureRows(light, *(_rows(full_size(one, frame), search) for one in off))
 
@@ -178,7 +170,7 @@ def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
     search : LaserBand
         Of the whole picture, with the colour of the laser.
     """
-    rows = picture_rows(frame, search, search.colour)
+    rows = picture_rows(frame, search)
     peaks = _peaks(rows.intensity, search, frame.luma.shape[1])
     order, start = _smooth_chains(peaks, search)
     n_measures = 12
@@ -293,7 +285,8 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
-                before, after = _middles(peaks, is_long, members[i])
+                before = _middle(peaks, is_long, members[i], -1)
+                after = _middle(peaks, is_long, members[i], 1)
                 low = min(int(np.ceil(max(low - halo_px, before, 1.0))), low)
                 high = max(int(min(high + halo_px, after, light.shape[1] - 2.0)), high)
                 halo += _sum_above_flanks(along[x], low, high)
@@ -314,26 +307,17 @@ def _measure(
 
 
 @inner_kernel
-def _middles(peaks: StripePeaks, is_long: BoolArray, i: int) -> tuple[float, float]:
-    """Return the midpoints between peak i and the next long segments before and after it.
+def _middle(peaks: StripePeaks, is_long: BoolArray, i: int, step: int) -> float:
+    """Return the midpoint between peak i and the next long segment, before (step -1) or after (1).
 
-    Positions along the search line in pixels; infinite where there is no such segment.
+    Position along the search line in pixels; infinite where there is no such segment.
     """
-    line, position = peaks.line, peaks.position
-    before, after = -np.inf, np.inf
-    k = i - 1
-    while k >= 0 and line[k] == line[i]:
+    line, position, k = peaks.line, peaks.position, i + step
+    while 0 <= k < line.shape[0] and line[k] == line[i]:
         if is_long[k]:
-            before = 0.5 * (position[k] + position[i])
-            break
-        k -= 1
-    k = i + 1
-    while k < line.shape[0] and line[k] == line[i]:
-        if is_long[k]:
-            after = 0.5 * (position[k] + position[i])
-            break
-        k += 1
-    return before, after
+            return float(0.5 * (position[k] + position[i]))
+        k += step
+    return step * np.inf
 
 
 @inner_kernel
@@ -372,10 +356,8 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
     along, halo = np.full(n, RATIO_EXPECTED), np.full(n, _EVIDENCE.halo_expected)
     most, across = halo, np.zeros(n)
     if has_colour:
-        along, halo = (
-            _clip_ratio(table, ALONG, RATIO_MIN),
-            _clip_ratio(table, HALO, _EVIDENCE.halo_expected),
-        )
+        along = _clip_ratio(table, ALONG, RATIO_MIN)
+        halo = _clip_ratio(table, HALO, _EVIDENCE.halo_expected)
         most, across = np.maximum(table[ALONG], table[HALO]), table[ACROSS]
     levels = np.maximum(np.maximum(along, halo), 0.0) * table[HEIGHT]
     as_expected = np.clip(halo, 0.0, _EVIDENCE.halo_expected)
