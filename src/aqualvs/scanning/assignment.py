@@ -333,7 +333,7 @@ class AssignmentTest:
             n_behind = _n_lasers_on(one, subsegments)
             if max(n_on_target, few) <= n_behind and n_on_target >= half * n_behind:
                 behind |= one.members
-        share: float = other_lines_share(
+        share = other_lines_share(
             linked.candidates,
             subsegments.of_candidate,
             target.members,
@@ -411,7 +411,7 @@ class AssignmentTest:
         for one in surfaces:
             if one is not surface:
                 others |= one.members
-        share: float = exclusive_share(
+        return exclusive_share(
             candidates.source,
             candidates.confidence,
             subsegments,
@@ -419,7 +419,6 @@ class AssignmentTest:
             others,
             surface.inlier_weight,
         )
-        return share
 
     def is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether too many of the lasers that should show a surface are faint on it."""
@@ -429,10 +428,9 @@ class AssignmentTest:
         self, surface: Surface, subsegments: Subsegments, *, along_strand: bool = False
     ) -> tuple[float, float, float, int]:
         """Return the `stripe_visibility` of a surface."""
-        found: tuple[float, float, float, int] = stripe_visibility(
+        return stripe_visibility(
             surface.plane.packed(), surface.members, subsegments, self._bands, along_strand
         )
-        return found
 
     def nearer_net(
         self, subsegments: Subsegments, surfaces: Sequence[Surface], target: Surface
@@ -575,13 +573,9 @@ def _verdict(planes: FloatArray, measures: FloatArray) -> AssignmentOutcome:
         if _log_odds(measures[best], measures[k]) < 0.0:
             best = k
     # The best one of those that differ from it.
-    second, odds = -1, math.inf
-    for k in range(len(planes)):
-        if _alike(planes[best], planes[k]):
-            continue
-        one = _log_odds(measures[best], measures[k])
-        if one < odds:
-            second, odds = k, one
+    others = [k for k in range(len(planes)) if not _alike(planes[best], planes[k])]
+    all_odds = ((_log_odds(measures[best], measures[k]), k) for k in others)
+    odds, second = min(all_odds, default=(math.inf, -1))
     kept = _alike(planes[best], planes[0])
     # Limits of range (as a share) and angle within which a larger sigma covers both hypotheses;
     # farther apart, the posture is refused.

@@ -243,10 +243,8 @@ class FrameDetector:
         options: DetectorOptions,
         field: Field | None = None,
     ) -> None:
-        width, height = size_px
-        self._field = field
-        self._size_px = size_px if field is None else (width, height // 2)
-        self._options = options
+        self._field, self._options = field, options
+        width, height = self._size_px = size_px if field is None else (size_px[0], size_px[1] // 2)
         visible = [band for band in laser_bands if band.visible]
         self._colours = sorted({one.colour for one in visible}, key=lambda colour: colour.name)
         # Each laser makes about one peak on a search line.
@@ -264,37 +262,29 @@ class FrameDetector:
         if field and SearchAxis.ALONG_Y in self._bands:
             lowest, highest = self._bands[SearchAxis.ALONG_Y]
             self._bands[SearchAxis.ALONG_Y] = lowest // 2, highest // 2
-        self._finders: Mapping[SearchAxis, PeakFinder] = (
-            {axis: self._finder(axis, options) for axis in self._bands}
-            if isinstance(options, StripeOptions)
-            else {}
-        )
+        self._finders: Mapping[SearchAxis, PeakFinder] = {}
+        self._threshold: Mapping[SearchAxis, ThresholdDetector] = {}
+        if isinstance(options, StripeOptions):
+            self._finders = {axis: self._finder(axis, options) for axis in self._bands}
+        else:
+            # Imported only for comparisons with the paper.
+            from aqualvs.scanning.paper import detector as paper
+
+            self._threshold = {
+                axis: paper.ThresholdDetector(axis, self._size_px, *band, options)
+                for axis, band in self._bands.items()
+            }
         self._room = options.max_returns
         # Peaks of all directions, one after the other. Rows whose length is a power of two would
         # map to the same few lines of the processor's cache: they are one cache line longer.
         self._line = np.empty(len(self._finders) * self._room, np.int64)
         self._table = np.empty((N_MEASURES, len(self._line) + _SAMPLE.cache_line))
-        self._threshold = (
-            {} if isinstance(options, StripeOptions) else self._threshold_detectors(options)
-        )
-        width, height = self._size_px
         self._lines = {
             axis: SearchLines(self._size_px, axis, line_px)
             for axis, line_px in self._line_px.items()
         }
         self._luma = np.empty((height, width), np.uint8)
         self._chroma = np.empty((2, -(-height // 2), -(-width // 2)), np.uint8)
-
-    def _threshold_detectors(
-        self, options: ThresholdOptions
-    ) -> Mapping[SearchAxis, "ThresholdDetector"]:
-        # Imported only for comparisons with the paper.
-        from aqualvs.scanning.paper.detector import ThresholdDetector
-
-        return {
-            axis: ThresholdDetector(axis, self._size_px, *band, options)
-            for axis, band in self._bands.items()
-        }
 
     def _finder(self, axis: SearchAxis, options: StripeOptions) -> PeakFinder:
         width, height = self._size_px
