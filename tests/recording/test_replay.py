@@ -105,6 +105,15 @@ def test_stripes_of_recordings_before_pulls_were_measured_have_none():
         np.testing.assert_array_equal(found.pull, np.zeros(found.n))
 
 
+@pytest.mark.parametrize("column", ["position", "height", "width", "likelihood", "pull"])
+def test_stripes_with_columns_of_different_lengths_are_not_understood(column):
+    (sample,) = demo_samples(1)
+    axis, found = next(iter(sample.peaks.items()))
+    cut = found._replace(**{column: getattr(found, column)[1:]})
+    with pytest.raises(ValueError, match=f"{found.n} peaks|pulls"):
+        stripes_of(stripes_message(replace(sample, peaks={**sample.peaks, axis: cut}), 0))
+
+
 def test_gyros_are_recorded_and_used_again(demo, tmp_path):
     shutter = Shutter(kind=ShutterKind.ROLLING, readout=0.02)
     rig = replace(load_rig(demo / "rig.yaml"), shutter=shutter)

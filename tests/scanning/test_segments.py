@@ -161,6 +161,16 @@ def test_what_lies_outside_the_band_is_left_out() -> None:
     np.testing.assert_array_equal(peaks.position[found.order], np.full(80, 150.0))
 
 
+@pytest.mark.parametrize("line", [-1, -(10**9), N_LINES, 10**12])
+def test_peaks_of_a_damaged_recording_outside_the_picture_are_left_out(line: int) -> None:
+    inside, nowhere = straight(0, 9, 100.0), (np.array([5]), np.array([np.nan]))
+    peaks = peaks_at(inside, (np.full(3, line), np.full(3, 100.0)), nowhere)
+    kept = link_segments(peaks, search_for()).order
+    assert set(peaks.line[kept]) == set(inside[0])
+    assert np.isfinite(peaks.position[kept]).all()
+    assert len(kept) == 10
+
+
 def test_no_returns() -> None:
     nothing = peaks_at((np.empty(0, np.int64), np.empty(0)))
     found = link_segments(nothing, search_for())

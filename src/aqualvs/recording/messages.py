@@ -123,13 +123,19 @@ def stripes_of(message: bytes) -> RecordedFrame:
     for _ in range(of.number("I")):
         axis = SearchAxis(of.text())
         line = of.array("u4").astype(np.int64)
-        position, height, width, likelihood = (of.array("f8") for _ in range(4))
+        measures = [of.array("f8") for _ in range(4)]
+        if any(len(one) != len(line) for one in measures):
+            raise ValueError(f"stripes of {len(line)} peaks have another number of measures")
+        position, height, width, likelihood = measures
         # Recordings of 0.1.0 have grey levels here, of peaks that passed a colour gate, or NaN.
         likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
         peaks[axis] = StripePeaks(line, position, height, width, likelihood, np.zeros(len(line)))
     if not of.at_end:
-        ends = np.cumsum([found.n for found in peaks.values()])
-        pulls = np.split(of.array("f8"), ends[:-1])
+        *ends, n = np.cumsum([0, *(found.n for found in peaks.values())])
+        pull = of.array("f8")
+        if len(pull) != n:
+            raise ValueError(f"stripes of {n} peaks have {len(pull)} pulls")
+        pulls = np.split(pull, ends[1:])
         peaks = {
             axis: found._replace(pull=pull)
             for (axis, found), pull in zip(peaks.items(), pulls, strict=False)

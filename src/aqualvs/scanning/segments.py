@@ -400,7 +400,8 @@ def _link(
     for i in range(n):
         x, place = line[i], position[i]
         segment_of[i] = -1
-        if place < lowest[x] or place > highest[x]:
+        # Peaks of a damaged recording may be anywhere.
+        if not (0 <= x < lowest.shape[0] and lowest[x] <= place <= highest[x]):
             continue
         if x != here:
             n_alive = _predict(x, n_alive, alive, track, due)
