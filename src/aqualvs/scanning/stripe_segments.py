@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inner_kernel, kernel
+from aqualvs.geometry.compiled import ZERO, inner_kernel, kernel
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import RATIO_EXPECTED, RATIO_MIN, WHITE, channel_image, full_size
 from aqualvs.scanning.scan import Frame, ImagePlane
@@ -285,8 +285,8 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
-                before = _middle(peaks, is_long, members[i], -1)
-                after = _middle(peaks, is_long, members[i], 1)
+                before = _middle(peaks, is_long, members[i], ZERO - 1)
+                after = _middle(peaks, is_long, members[i], ZERO + 1)
                 low = min(int(np.ceil(max(low - halo_px, before, 1.0))), low)
                 high = max(int(min(high + halo_px, after, light.shape[1] - 2.0)), high)
                 halo += _sum_above_flanks(along[x], low, high)
