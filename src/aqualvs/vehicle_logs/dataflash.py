@@ -16,6 +16,7 @@ Records read for each signal, with reasons:
 - UTC: `GPS` (leap seconds of 2017 subtracted), else `RTC`.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -308,9 +309,11 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
             "of a dive"
         )
     begin = min(starts)
+    # Records have no checksum: damaged ones may contain any number. No sea is deeper.
+    max_depth_m, max_angle_deg = 12000.0, 720.0
     candidates = [
-        _signal(tables, begin, *source)
-        for source in (
+        _signal(tables, begin, record, column, sign, max_depth_m)
+        for record, column, sign in (
             ("CTUN", "Alt", -1.0),
             ("POS", "RelHomeAlt", -1.0),
             ("XKF1", "PD", 1.0),
@@ -320,13 +323,13 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
     ]
     pressure, _ = candidates[-1]
     depth, stuck = choose_depth([*candidates, _barometer(tables, begin)], pressure)
-    found = {"depth": depth}
+    found, degree = {"depth": depth}, math.radians(1.0)
     for name, column, interpolation in (
         ("heading", "Yaw", Interpolation.BEARING),
         ("roll", "Roll", Interpolation.ANGLE),
         ("pitch", "Pitch", Interpolation.ANGLE),
     ):
-        found[name] = _signal(tables, begin, "ATT", column, interpolation=interpolation)
+        found[name] = _signal(tables, begin, "ATT", column, degree, max_angle_deg, interpolation)
     utc, utc_from = _start_utc(tables, begin)
     # The vehicle's clock is set once, to about a second.
     utc_sigma_s = 1.0
@@ -359,27 +362,22 @@ def _signal(
     begin: float,
     record: str,
     column: str,
-    scale: float = 1.0,
+    unit: float,
+    largest: float,
     interpolation: Interpolation = Interpolation.LINEAR,
 ) -> Found:
-    """Return a column as a signal, None if it is missing, and its source; `begin` is log time 0.
+    """Return a column times its unit as a signal, None if it is missing, and its source.
 
-    Depths are scaled, angles are turned from degrees into radians.
+    `begin` is log time 0. Numbers beyond `largest`, in the column's own unit, are left out.
     """
     table, source = tables.get(record, {}), f"{record}.{column}"
     if column not in table:
         return None, source
-    # Records have no checksum: damaged ones may contain any number. No sea is deeper.
-    max_depth_m, max_angle_deg = 12000.0, 720.0
-    is_depth = interpolation is Interpolation.LINEAR
-    largest = max_depth_m if is_depth else max_angle_deg
-    values = np.where(np.abs(table[column]) <= largest, table[column], np.nan)
-    if is_depth:
-        values = scale * values
-    elif interpolation is Interpolation.BEARING:
-        values = bearing_of(np.deg2rad(values))
-    else:
-        values = wrap(np.deg2rad(values))
+    values = unit * np.where(np.abs(table[column]) <= largest, table[column], np.nan)
+    if interpolation is Interpolation.BEARING:
+        values = bearing_of(values)
+    elif interpolation is Interpolation.ANGLE:
+        values = wrap(values)
     return Signal.from_samples(table["time_s"] - begin, values, interpolation), source
 
 

@@ -251,13 +251,13 @@ def _heading(tables: _Tables, clock: TelemetryClock) -> Found:
     unknown_heading = 65535
     if table is not None:
         known["GLOBAL_POSITION_INT"] = table[table.payload["hdg"] != unknown_heading]
-    heading, source = None, ""
     for message, field, unit, precision in (
         ("ATTITUDE", "yaw", 1.0, ""),
         ("GLOBAL_POSITION_INT", "hdg", math.radians(0.01), ""),
         ("VFR_HUD", "heading", math.radians(1.0), " (whole degrees)"),
     ):
-        if heading is None:
-            heading = _signal(known, clock, message, field, unit, Interpolation.BEARING)
-            source = f"{message}.{field}{precision}"
+        heading = _signal(known, clock, message, field, unit, Interpolation.BEARING)
+        source = f"{message}.{field}{precision}"
+        if heading is not None:
+            break
     return heading, source
