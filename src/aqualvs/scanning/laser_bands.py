@@ -199,7 +199,7 @@ def _target_normals() -> FloatArray:
     They bound the direction of a stripe.
     """
     max_tilt, right, up = np.deg2rad(45.0), np.eye(3)[0], np.eye(3)[2]
-    tilts = (0.0 * up, -max_tilt * right, -max_tilt * up, max_tilt * right, max_tilt * up)
+    tilts = (np.zeros(3), -max_tilt * right, -max_tilt * up, max_tilt * right, max_tilt * up)
     return np.stack([rotation_from_rotvec(tilt) @ np.array([0.0, 1.0, 0.0]) for tilt in tilts])
 
 

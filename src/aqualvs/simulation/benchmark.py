@@ -33,7 +33,7 @@ from aqualvs.simulation.lasers import LUMA
 from aqualvs.simulation.render import Renderer, SceneAt
 from aqualvs.simulation.scenario import Scenario, packaged, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.scene import Scene, SurfaceKind
+from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.truth import Cell, LitPoints, target_fit
 from aqualvs.simulation.video import VideoWriter
 
@@ -304,7 +304,7 @@ def visible_lit(
     `radiance` is that of the scene, if it is known.
     """
     lit = renderer.lit_points(scene, t)
-    label = SurfaceKind[scene.target.upper()]
+    label = scene.target_kind
     if not np.any(lit.label == label):
         return _part(lit, np.empty(0, np.int64))
     seen = renderer.radiance(scene, t) if radiance is None else radiance

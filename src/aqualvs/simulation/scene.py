@@ -197,6 +197,11 @@ class Scene(SceneContent):
 
     dome_from_scene: SE3  # Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
 
+    @property
+    def target_kind(self) -> SurfaceKind:
+        """Kind of surface that the target is."""
+        return SurfaceKind[self.target.upper()]
+
     def target_plane(self) -> Plane:
         """Return the target plane in `dome`, its normal away from the vehicle."""
         normal = self.dome_from_scene.rotation[:, 1]

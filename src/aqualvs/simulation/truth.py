@@ -216,7 +216,7 @@ def target_fit(scene: Scene, lit: LitPoints) -> tuple[Plane, float] | None:
     nearest to the dome's centre, moved to where the lit points are; else the plane through the lit
     points, without those on other walls.
     """
-    lit_points: FloatArray = lit.points_in_dome[lit.label == SurfaceKind[scene.target.upper()]]
+    lit_points: FloatArray = lit.points_in_dome[lit.label == scene.target_kind]
     if scene.target == "wall":
         off = scene.target_plane().signed_distance(lit_points)
         lit_points = lit_points[np.abs(off) < _ON_WALL]

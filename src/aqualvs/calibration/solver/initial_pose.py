@@ -13,7 +13,7 @@ camera and boards together until most boards stand square to the dome.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import cv2
 import numpy as np
@@ -116,7 +116,7 @@ class _PoseProblem:
 
     camera: Camera
     view: View
-    n_parameters: int = 6
+    n_parameters: ClassVar[int] = 6
 
     def blocks(self, state: SE3) -> list[Block]:
         points = state.apply(self.view.points)
