@@ -27,11 +27,11 @@ from live_cases import demo_frames, demo_rig
 from ports import free_port
 from repository import HELPERS
 from shell_cases import write_video
-from waiting import TIMEOUT_S
+from waiting import TIMEOUT_S, until
 
 pytest.importorskip("pymavlink")
 
-from fake_ardusub_cases import Fake, is_neutral, until
+from fake_ardusub_cases import Fake, is_neutral
 from stream_sender import make_clip
 
 SENDER = HELPERS / "stream_sender.py"

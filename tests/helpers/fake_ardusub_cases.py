@@ -29,7 +29,7 @@ from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources.base import Health
 from fake_ardusub import PARAMETERS
 from live_cases import demo_rig
-from waiting import TIMEOUT_S
+from waiting import TIMEOUT_S, until
 
 FRAME_S = 0.04
 HELD = Setpoint(0.6)
@@ -54,13 +54,6 @@ AT_START = {
     "at": [0.9, 0.0],
 }
 STEERED = ("MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
-
-
-def until(condition: Callable[[], object], what: str, patience_s: float = TIMEOUT_S) -> None:
-    end = time.monotonic() + patience_s
-    while not condition():
-        assert time.monotonic() < end, f"{what} did not happen"
-        time.sleep(0.005)
 
 
 class Fake:

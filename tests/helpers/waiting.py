@@ -11,9 +11,13 @@ TIMEOUT_S = 180.0
 """So long is waited for what must happen in the end; only a test that fails waits so long."""
 
 
-def until(condition: Callable[[], object], what: str = "what was waited for") -> None:
+def until(
+    condition: Callable[[], object],
+    what: str = "what was waited for",
+    patience_s: float = TIMEOUT_S,
+) -> None:
     """Wait until a condition is true; fail where it never becomes so."""
-    end = time.monotonic() + TIMEOUT_S
+    end = time.monotonic() + patience_s
     while not condition():
         assert time.monotonic() < end, f"{what} did not happen"
         time.sleep(0.005)

@@ -10,10 +10,11 @@ from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub import ArduSubOptions
 from aqualvs.sources.base import State
+from waiting import until
 
 pytest.importorskip("pymavlink")
 
-from fake_ardusub_cases import AT_START, Dive, Fake, pushed, until
+from fake_ardusub_cases import AT_START, Dive, Fake, pushed
 
 FAR = Setpoint(0.4)
 """So far from where the vehicle is that sticks are large."""
