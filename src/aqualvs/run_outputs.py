@@ -23,7 +23,6 @@ from aqualvs.report.overlay import OverlayWriter, draw_overlay
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import (
     DIVE_MCAP,
-    NET_MAP_PNG,
     OVERLAY_MP4,
     POSTURE_BARE_CSV,
     RUN_FILES,
@@ -255,5 +254,4 @@ def write_net(net: NetPass, request: RunRequest) -> list[str]:
     """
     # The clock of a video may help to align the vehicle's log with it.
     video = Path(request.source) if Path(request.source).is_file() else None
-    result = net.write(request.out, video)
-    return [*result.lines, f"map of the net: {request.out / NET_MAP_PNG}"]
+    return net.write(request.out, video).lines

@@ -26,9 +26,10 @@ def leave_maps_blank(patch: pytest.MonkeyPatch) -> None:
         NET_MAP_SVG: b'<svg xmlns="http://www.w3.org/2000/svg"/>',
     }
 
-    def draw(_wall: object, paths: list[Path]) -> None:
+    def draw(_wall: object, paths: list[Path]) -> bool:
         for path in paths:
             path.write_bytes(blank[path.name])
+        return True
 
     patch.setattr("aqualvs.nets.map.draw_map", draw)
 

@@ -181,6 +181,7 @@ _EXTRAS = {
     "rerun": (("rerun-sdk",), "--rerun"),
     "dds": (("cyclonedds", "rosbags"), "ROS 2 without ROS"),
     "batch": (("distributed",), "aqualvs batch"),
+    "plots": (("matplotlib",), "maps of nets, figures"),
 }
 """By extra of the package: the packages that it installs, and their purpose."""
 

@@ -81,6 +81,9 @@ def reproduce(
     list_: Annotated[bool, Option("--list", help="List the experiments and exit.")] = False,
 ) -> None:
     """Run the paper's experiments."""
+    from aqualvs.report.figure_style import check_matplotlib
+
+    check_matplotlib("aqualvs reproduce")
     from aqualvs.experiments import command as body
 
     if list_:

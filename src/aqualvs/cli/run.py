@@ -183,6 +183,9 @@ def figures(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw a run's reflections."""
+    from aqualvs.report.figure_style import check_matplotlib
+
+    check_matplotlib("aqualvs figures")
     from aqualvs.report import mesh_figures as body
 
     body.figures(

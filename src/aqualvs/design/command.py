@@ -45,6 +45,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.report.figure_style import check_matplotlib
 from aqualvs.results.files import Claim, writing
 from aqualvs.yamlfile import parse_yaml
 
@@ -79,6 +80,8 @@ def run_design(request: DesignRequest) -> None:
 
     Raises `AqualvsError` if a file or an option cannot be used, or the folder cannot be written.
     """
+    if request.out is not None:
+        check_matplotlib("aqualvs design -o")
     output = _Output()
     design = _requested_design(request)
     names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG, DESIGN_HTML)

@@ -33,6 +33,7 @@ from aqualvs.live.pilot import PilotReport
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.shutter import Shutter
 from aqualvs.recording.sample import Instants, LiveSample
+from aqualvs.report.figure_style import check_matplotlib
 from aqualvs.results.files import Claim
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
@@ -260,6 +261,7 @@ def run_simulation(request: SimRequest, echo: Echo) -> int:
 
     Raises `AqualvsError` if an input cannot be used, or the folder cannot be written.
     """
+    check_matplotlib("aqualvs follow --sim")
     rig = example_rig()
     if request.shutter is not None:
         rig = replace(rig, shutter=shutter_from_words(request.shutter, request.fps))

@@ -19,18 +19,11 @@ from aqualvs.net_survey.surveys import (
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.pipeline import run_and_print
+from aqualvs.report.figure_style import check_matplotlib
 from aqualvs.report.run_data import mapping
 from aqualvs.report.run_page import write_report
 from aqualvs.results.files import Claim, writing
-from aqualvs.results.folder import (
-    NET_FILES,
-    NET_MAP_PNG,
-    POSTURE_CSV,
-    REPORT_HTML,
-    RUN_YAML,
-    claim_run,
-    recover,
-)
+from aqualvs.results.folder import NET_FILES, POSTURE_CSV, REPORT_HTML, RUN_YAML, claim_run, recover
 from aqualvs.results.net_survey import NetPass, check_stored, read_run
 from aqualvs.results.run_request import RunRequest, Status, read_run_yaml, scanner_options
 from aqualvs.sources.opening import folder_beside
@@ -100,7 +93,7 @@ def net_of_run(place: NetSource, request: NetRequest, echo: Echo) -> int:
                 if stop.caught:
                     break
         result = net.write(folder, stored.video)
-    for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
+    for line in result.lines:
         echo(line)
     if stop.caught:
         echo(f"stopped by {stop.caught.name}; {folder} covers the frames before")
@@ -191,6 +184,7 @@ def net_change(request: NetChangeRequest, echo: Echo) -> "Comparison":
     Raises `AqualvsError` if a run cannot be read or a file not be written, or there is nothing to
     compare.
     """
+    check_matplotlib("aqualvs net-change")
     # `aqualvs net` and the processes of a batch need neither SciPy nor charts.
     from aqualvs.net_survey import tables
     from aqualvs.net_survey.comparison import compare

@@ -3,6 +3,7 @@
 Drawn without a display; Matplotlib is loaded only when a map is drawn.
 """
 
+import importlib.util
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,12 +38,17 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
+def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> bool:
     """Draw the map of a net; without a stretch the picture says so.
 
-    The suffix of each path (`.png`, `.svg`, `.pdf`) selects its format. Raises `OSError` if a file
-    cannot be written.
+    The suffix of each path (`.png`, `.svg`, `.pdf`) selects its format. If Matplotlib is not
+    installed, earlier maps are deleted, for they are of other results, and False is returned.
+    Raises `OSError` if a file cannot be written.
     """
+    if importlib.util.find_spec("matplotlib") is None:
+        for path in paths:
+            path.unlink(missing_ok=True)
+        return False
     import matplotlib as mpl
 
     dpi = 160
@@ -52,6 +58,7 @@ def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
             # A date would make equal maps differ.
             dated = {".svg": "Date", ".pdf": "CreationDate"}.get(path.suffix.lower())
             figure.savefig(path, dpi=dpi, metadata={dated: None} if dated else None)
+    return True
 
 
 def _figure(wall: UnrolledNet) -> "Figure":

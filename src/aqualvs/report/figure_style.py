@@ -3,13 +3,22 @@
 Figures are one or two columns wide.
 """
 
+import importlib.util
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from aqualvs.errors import OptionError
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def check_matplotlib(purpose: str) -> None:
+    """Raise `OptionError` if Matplotlib is not installed, which `purpose` needs."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise OptionError(f"{purpose} needs matplotlib; pip install 'aqualvs[plots]'")
 
 
 def new_canvas(width_in: float, height_in: float) -> "Figure":

@@ -103,10 +103,11 @@ class NetPass:
             "summary": summary,
         }
         with writing(folder):
-            write_net_files(folder, wall, metadata)
+            has_map = write_net_files(folder, wall, metadata)
         lines = net_lines(wall, area, self._n_frames)
         if log is not None:
             lines += [*log.log.notes, log.words()]
+        lines.append(f"map of the net: {folder / NET_MAP_PNG if has_map else _NO_MAP}")
         return NetResult(summary, lines)
 
     def _check_twine(self, bars: Sequence[float]) -> None:
@@ -121,8 +122,11 @@ class NetPass:
             )
 
 
-def write_net_files(folder: Path, wall: "UnrolledNet", metadata: dict[str, Any]) -> None:
-    """Write tables first, pictures last.
+_NO_MAP = "not drawn, matplotlib is missing; pip install 'aqualvs[plots]'"
+
+
+def write_net_files(folder: Path, wall: "UnrolledNet", metadata: dict[str, Any]) -> bool:
+    """Write tables first, pictures last; return whether there is a map (`draw_map`).
 
     Raises `OSError` as the system says it.
     """
@@ -139,7 +143,7 @@ def write_net_files(folder: Path, wall: "UnrolledNet", metadata: dict[str, Any])
     write_table(folder / NET_CSV, NET_COLUMNS, stretch_rows(wall))
     write_table(folder / HOLES_CSV, HOLE_COLUMNS, hole_rows(wall))
     write_geojson(folder / NET_GEOJSON, wall, metadata)
-    draw_map(wall, [folder / NET_MAP_PNG, folder / NET_MAP_SVG])
+    return draw_map(wall, [folder / NET_MAP_PNG, folder / NET_MAP_SVG])
 
 
 def _is_net(scan: Scan) -> bool:
