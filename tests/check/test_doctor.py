@@ -5,6 +5,7 @@ import io
 import re
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +15,8 @@ from aqualvs.check import doctor
 from aqualvs.check import doctor as doctor_autopilot
 from aqualvs.check.doctor import _EXTRAS, run_doctor
 from aqualvs.errors import AqualvsError
-from aqualvs.text import Finding
+from aqualvs.geometry import compiled
+from aqualvs.text import Finding, Severity
 from field_cases import interlaced_rig, woven_dive
 from ports import free_port
 from repository import ROOT
@@ -43,6 +45,24 @@ def test_this_machine_decodes_and_measures(monkeypatch: pytest.MonkeyPatch) -> N
     text = told()
     assert "H.264 decoded: 40 frames" in text
     assert "posture in 39 of 40 frames" in text or "posture in 40 of 40 frames" in text
+
+
+def test_the_speed_is_that_of_compiled_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python runs some kernels in the first seconds of a process, but not in a live run."""
+    interprets = []
+
+    class Probe:
+        def __init__(self, _rig: object) -> None: ...
+
+        def process(self, _frame: object) -> SimpleNamespace:
+            interprets.append(compiled._interpreter.is_allowed)
+            return SimpleNamespace(posture=True)
+
+    monkeypatch.setattr(doctor, "Scanner", Probe)
+    rig: Any = SimpleNamespace(size_px=(720, 576))
+    frames: list[Any] = [None] * 3
+    assert MEASURE(rig, frames).severity is Severity.OK
+    assert interprets == [False] * 4
 
 
 def test_a_source_that_fits_the_rig(monkeypatch: pytest.MonkeyPatch) -> None:
