@@ -21,12 +21,15 @@ import numpy as np
 import pytest
 
 from aqualvs.cli.main import main
+from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.errors import SourceError
-from aqualvs.live.command import Console, status_line
+from aqualvs.live.command import Console, LiveRequest, make_runner, status_line
+from aqualvs.live.runner import ScannerProvider
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.recording import DiveRecording, is_recording
 from aqualvs.results.folder import POSTURE_COLUMNS
 from aqualvs.sources.base import Health, PartHealth, State, bgr_of
+from aqualvs.sources.opening import open_feed
 from complaints import complaints
 from live_cases import demo_frames, demo_rig, first_sample
 from ports import free_port
@@ -297,7 +300,8 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(
         before = len(run.valid())
         enough = before + N_AT_LEAST
         run.send_until(clips["dive"], lambda: len(run.valid()) >= enough, "postures afterwards")
-        assert run.end(signal.SIGINT) == 0
+        assert run.end(signal.SIGINT) == 2
+        run.wait(lambda: any("samples lost" in text for text in run.told), "what was lost")
     (recording,) = (tmp_path / "dives").glob("*.mcap")
     assert recording.stat().st_size <= LIMIT
     assert replayed(recording, tmp_path / "run")
@@ -405,6 +409,30 @@ def test_the_line_of_the_terminal_shows_a_sigma_below_a_millimetre() -> None:
         r"range 0\.\d{3} m ± 0\.\d mm  yaw \+1\d\.\d ± 0\.\d\d deg  pitch -6\.\d ± 0\.\d\d deg  \|"
     )
     assert re.match(said, line)
+
+
+def test_the_log_tells_a_fault_of_another_cause_once(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console()
+    for detail in ("waiting for 2 s", "waiting for 3.5 s", "not H.264", "not H.264"):
+        source = PartHealth("udp", State.FAULT, detail)
+        console.send(replace(first_sample(), health=replace(Health(), source=source)))
+    assert capsys.readouterr().err == "udp: fault: waiting for 2 s\nudp: fault: not H.264\n"
+
+
+def test_a_stop_while_getting_ready_leaves_no_recording(rig_file: Path, tmp_path: Path) -> None:
+    def stop() -> ScannerProvider:
+        raise KeyboardInterrupt
+
+    rig, dives = load_rig(rig_file), tmp_path / "dives"
+    request = LiveRequest(
+        feed=lambda: open_feed("udp://127.0.0.1:0", realtime=True),
+        rig=rig_file,
+        record=True,
+        record_to=dives,
+    )
+    with pytest.raises(KeyboardInterrupt):
+        make_runner(request, rig, stop, SetpointHolder(rig.working_range), print)
+    assert not dives.exists()
 
 
 def test_the_log_tells_a_part_that_is_well_again(capsys: pytest.CaptureFixture[str]) -> None:

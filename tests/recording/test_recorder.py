@@ -414,6 +414,8 @@ def test_a_recording_that_ends_on_a_full_disk_counts_what_is_lost(tmp_path, samp
     output.close()
     assert output.health().state is State.FAULT
     assert output.health().n_dropped == 3
+    assert "the disk is full" in output.health().detail
+    assert output.health().detail.endswith("3 samples lost")
     assert counted(read_by_mcap(path))[STRIPES.name] == 1
 
 

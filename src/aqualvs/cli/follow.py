@@ -76,7 +76,8 @@ def follow(
         str | None,
         Option(
             metavar="FILE|NAME",
-            help="Gains: a file from 'aqualvs tune', or bluerov2, bluerov2_heavy, videoray.",
+            help="Gains: a file from 'aqualvs tune', or bluerov2, bluerov2_heavy, videoray; "
+            "with --sim tuned for the vehicle by default.",
         ),
     ] = None,
     rig: Annotated[Path | None, Option(help="Vehicle: rig file (YAML).")] = None,

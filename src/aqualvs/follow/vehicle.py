@@ -20,7 +20,7 @@ from aqualvs.control.tune import usable_gains
 from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.errors import AqualvsError, OutputError
 from aqualvs.follow.command import FOLLOW_CSV, Aim
-from aqualvs.live.command import LiveRequest, make_runner
+from aqualvs.live.command import LiveRequest, make_runner, run_and_sum_up
 from aqualvs.live.mavlink.ardusub import ArduSubLink
 from aqualvs.live.mavlink.link import MavlinkLink
 from aqualvs.live.options import VehicleSetup
@@ -34,7 +34,7 @@ from aqualvs.results.run_request import prepared_rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
-from aqualvs.terminal import Echo, StopSignals
+from aqualvs.terminal import Echo
 
 _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 
@@ -135,11 +135,9 @@ def run_follow(request: FollowRequest, echo: Echo, keys: TextIO | None = None) -
             )
             echo("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
             listen(pilot, sys.stdin if keys is None else keys, echo)
-            with StopSignals() as stop:
-                fault = runner.run(lambda: stop.caught is not None)
-    if fault is not None:
-        raise fault
-    return 0
+            code = run_and_sum_up(runner, echo)
+    echo(f"written: {log}")
+    return code
 
 
 def _outputs(link: MavlinkLink, pilot: Pilot, log: Path) -> Iterator[Output]:

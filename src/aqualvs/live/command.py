@@ -6,6 +6,7 @@ for it. `Console` reports in the terminal: a status line that stays, or occasion
 
 import math
 import queue
+import re
 import sys
 import threading
 import time
@@ -16,7 +17,7 @@ from pathlib import Path
 
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder, VehicleState
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, OutputError
 from aqualvs.live.options import Page, vehicle_reader
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerProvider, warm_up
@@ -70,6 +71,7 @@ class WaterFollower(ScannerProvider):
 
 
 _SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class Console(Output):
@@ -83,6 +85,7 @@ class Console(Output):
         # A log begins with what goes wrong: of a run that ends at once, nothing else is told.
         self._next_s = -math.inf if self._on_screen else time.monotonic() + _LOG_EVERY_S
         self._states: dict[str, State] = {}
+        self._causes: dict[str, str] = {}  # Of faults.
 
     def send(self, sample: LiveSample) -> None:
         """Tell of parts that have changed at once, and of the posture when it is time."""
@@ -108,7 +111,12 @@ class Console(Output):
         for part in (health.source, *health.lasers, *health.outputs):
             before = self._states.get(part.name, State.OFF)
             self._states[part.name] = part.state
-            if part.state is not before and {part.state, before} & {State.WARN, State.FAULT}:
+            # The cause of a fault may change, not only the numbers in its words.
+            cause = _NUMBER.sub("", part.detail) if part.state is State.FAULT else ""
+            is_other = cause != self._causes.get(part.name, "")
+            self._causes[part.name] = cause
+            is_bad = bool({part.state, before} & {State.WARN, State.FAULT})
+            if is_bad and (part.state is not before or is_other):
                 detail = part.detail and f": {part.detail}"
                 self._write(f"{part.name}: {part.state.value}{detail}", stays=True)
 
@@ -185,9 +193,22 @@ def run_live(request: LiveRequest, echo: Echo) -> int:
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     holder = SetpointHolder(rig.working_range, followed=False)
     runner = make_runner(request, rig, lambda: _provider(request, rig), holder, echo)
+    return run_and_sum_up(runner, echo)
+
+
+def run_and_sum_up(runner: LiveRunner, echo: Echo) -> int:
+    """Run until the source ends or the user stops it; print what was measured, and return 0.
+
+    Raises `AqualvsError` if the source failed for good, or a recording could not be written.
+    """
     with StopSignals() as stop:
         fault = runner.run(lambda: stop.caught is not None)
     echo(f"{runner.n_measured} frames measured, {runner.n_postures} with a posture")
+    for part in runner.incomplete():
+        if part.state is State.FAULT and fault is None:
+            fault = OutputError(f"{part.name}: {part.detail}")
+        else:
+            echo(f"{part.name}: {part.detail}")
     if fault is not None:
         raise fault
     return 0
@@ -232,10 +253,13 @@ def make_runner(
             add([request.page.serve(rig, holder, recorder, echo, reader)])
         smoothing = PostureFilter() if request.smooth else None
         every = LiveOptions(keep_every=request.fast)
+        provided = provider()
+        closing.callback(provided.close)
         if request.record:
-            # Where one of the parts above cannot be made, no file is left.
+            # Last: where a part cannot be made, or is stopped while kernels are compiled, no file
+            # is left.
             echo(f"recording: {recorder.start()}")
-        runner = LiveRunner(feed, provider(), outputs, every, smoothing)
+        runner = LiveRunner(feed, provided, outputs, every, smoothing)
         closing.pop_all()
     return runner
 

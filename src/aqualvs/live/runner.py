@@ -112,6 +112,7 @@ class OutputWorker:
         self._fault = ""
         self._n_dropped = 0
         self._waiting: deque[LiveSample] = deque()
+        self.keeps_all = output.keeps_all
         self._room = _QUEUE if output.keeps_all else 1
         self._changed = threading.Condition()
         self._closing = False
@@ -140,7 +141,7 @@ class OutputWorker:
             return PartHealth(self.name, State.FAULT, f"{fault}", self._n_dropped)
         if self._fault:
             found = PartHealth(found.name, State.FAULT, self._fault, found.n_dropped)
-        elif self._output.keeps_all and self._n_dropped and found.state is State.OK:
+        elif self.keeps_all and self._n_dropped and found.state is State.OK:
             found = replace(found, state=State.WARN)
         return replace(found, n_dropped=found.n_dropped + self._n_dropped)
 
@@ -386,6 +387,11 @@ class LiveRunner:
             for worker in self._workers:
                 worker.close()
         return self._reader.fault
+
+    def incomplete(self) -> list[PartHealth]:
+        """Return the state of outputs that were to keep everything and, at the end, have not."""
+        parts = (worker.health() for worker in self._workers if worker.keeps_all)
+        return [one for one in parts if one.n_dropped or one.state is State.FAULT]
 
     def health(self) -> Health:
         """Return the health of the run; figures are at most a tenth of a second old."""

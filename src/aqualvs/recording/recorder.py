@@ -21,6 +21,7 @@ from aqualvs.recording.growing_file import Chunk, ChunkBuilder, GrowingFile
 from aqualvs.recording.messages import RecordClock, RecorderOptions, SampleEncoder
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
+from aqualvs.text import count_text
 
 # Size of uncompressed messages at which a chunk is written before it is due.
 MAX_CHUNK_BYTES = 4 << 20
@@ -169,15 +170,20 @@ class Recorder:
         """Return size and duration of the recording, or the fault that stops it."""
         n_dropped = self._n_dropped
         size = f"{1e-6 * self._file.n_bytes:.1f} MB"
+        lost = f", {count_text(n_dropped, 'sample')} lost" if n_dropped else ""
         if self._fault:
-            return PartHealth(self.name, State.FAULT, f"{self._fault}; {size} kept", n_dropped)
+            # Until the recording ends, what waits in memory may still be written.
+            waiting_mb = 1e-6 * self._waiting_bytes
+            lost = f", {waiting_mb:.1f} MB waiting{lost}" if self._waiting_bytes else lost
+            detail = f"{self.path.name}: {self._fault}; {size} kept{lost}"
+            return PartHealth(self.name, State.FAULT, detail, n_dropped)
         if self._closing:
-            return PartHealth(self.name, State.OFF, f"{self.path.name}, {size}", n_dropped)
+            state = State.WARN if n_dropped else State.OFF
+            return PartHealth(self.name, state, f"{self.path.name}, {size}{lost}", n_dropped)
         seconds = time.monotonic() - self._began_s
-        detail = f"{self.path.name}, {size} in {seconds:.0f} s"
-        if n_dropped:
-            return PartHealth(self.name, State.WARN, f"{detail}, {n_dropped} lost", n_dropped)
-        return PartHealth(self.name, State.OK, detail)
+        state = State.WARN if n_dropped else State.OK
+        detail = f"{self.path.name}, {size} in {seconds:.0f} s{lost}"
+        return PartHealth(self.name, state, detail, n_dropped)
 
     def close(self) -> None:
         """Write the remaining messages and close the file; further calls do nothing."""
