@@ -191,7 +191,8 @@ def test_a_stream_joined_before_a_key_frame_is_neither_damaged_nor_running(monke
         reception.note_held(1)
         health = reception.health()
         assert health.state is State.FAULT
-        assert health.detail == f"RTP H.264: waiting for a whole key frame for {waited} s"
+        waits = f"waiting for a whole key frame with SPS and PPS for {waited} s"
+        assert health.detail == f"RTP H.264: {waits}"
     for i in range(27):
         monkeypatch.setattr(time, "monotonic", lambda i=i: now + 33.0 + 0.04 * i)
         reception.note_arrival()
@@ -211,3 +212,22 @@ def test_numbers_rise_over_a_new_connection():
             found += frames.feed(packet(data, pts))
     assert [f.index for f in found] == list(range(72))
     assert all(b.time_s >= a.time_s for a, b in pairwise(found))
+
+
+def test_a_sender_that_was_off_has_lost_nothing(monkeypatch):
+    """It begins with another number and another time, as a camera does that was switched on."""
+    packets, now = encoded(24, KINDS["one slice"]), [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    reception = Reception("test")
+    frames = LiveFrames(reception)
+    frames.connect(av.CodecContext.create("h264", "r"), 1 / 25, reports_losses=True)
+    found = []
+    for pause_s in (0.0, 8.0):
+        now[0] += pause_s
+        for data, pts in packets:
+            now[0] += 0.04
+            found += frames.feed(packet(data, pts))
+        frames.restart()
+    assert [f.index for f in found] == list(range(48))
+    assert found[24].time_s - found[23].time_s == pytest.approx(8.04)
+    assert reception.health().n_dropped == 0

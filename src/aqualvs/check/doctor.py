@@ -45,6 +45,7 @@ from aqualvs.scanning.scan import Frame
 from aqualvs.sources import open_source
 from aqualvs.sources.base import State
 from aqualvs.sources.fields import FieldEvidence, frames_of
+from aqualvs.sources.live_frames import NOTHING_YET
 from aqualvs.sources.opening import is_address
 from aqualvs.sources.video import sampled_pictures
 from aqualvs.terminal import told_if_slow
@@ -319,10 +320,12 @@ def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
     rig = None if rig_file is None else load_rig(rig_file)
     frames, span_s, health, fault = _received(where)
     if not frames:
-        yield Finding.bad(
-            f"{where}: no picture in {_STREAM_S:.0f} s ({health}); is the sender on, its address "
-            "this machine's, the port open in the firewall?"
-        )
+        advice = ""
+        if health.startswith(NOTHING_YET):
+            advice = (
+                "; is the sender on, its address this machine's, the port open in the firewall?"
+            )
+        yield Finding.bad(f"{where}: no picture in {_STREAM_S:.0f} s ({health}){advice}")
         return
     height, width = frames[-1].luma.shape
     lost = frames[-1].index - frames[0].index + 1 - len(frames)

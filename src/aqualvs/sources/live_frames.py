@@ -54,6 +54,7 @@ class StreamClock:
         self._anchor_ticks: int | None = None
         self._last = 0.0
         self._last_arrival: float | None = None
+        self.is_anew = False  # Whether the last picture did not go on with the clock before it.
 
     def set_tick(self, tick: float) -> None:
         """Go on with ticks of another length in seconds, after a new connection."""
@@ -69,6 +70,7 @@ class StreamClock:
         passed = 0.0 if self._last_arrival is None else max(0.0, arrival - self._last_arrival)
         time = expected = self._last + passed
         if ticks is not None:
+            self.is_anew = self._anchor_ticks is None
             if self._anchor_ticks is None:
                 self._anchor, self._anchor_ticks = expected, ticks
             time = self._anchor + (ticks - self._anchor_ticks) * self._tick
@@ -76,13 +78,16 @@ class StreamClock:
         disagree_s = 5.0
         if time < self._last or abs(time - expected) > disagree_s:
             self._anchor, self._anchor_ticks = expected, ticks
-            time = expected
+            time, self.is_anew = expected, True
         self._last, self._last_arrival = time, arrival
         return time
 
 
 _SILENT_S = 0.5
 """Longer silence is a fault."""
+
+NOTHING_YET = "waiting for the stream"
+"""Beginning of the detail of a reception that nothing has come to."""
 
 
 class Reception:
@@ -171,12 +176,14 @@ class Reception:
         if self._fault:
             return State.FAULT, self._fault
         if self._last_arrival is None:
-            return State.FAULT, f"waiting for the stream for {now - self._began:.0f} s"
+            return State.FAULT, f"{NOTHING_YET} for {now - self._began:.0f} s"
         silent_s = now - self._last_arrival
         if silent_s > self._timeout():
             return State.FAULT, f"silent for {silent_s:.1f} s; waiting for its return"
         if self._last_frame is None:
-            waiting = f"waiting for a whole key frame for {now - self._began:.1f} s"
+            waiting = (
+                f"waiting for a whole key frame with SPS and PPS for {now - self._began:.1f} s"
+            )
             return State.FAULT, f"{self._content}: {waiting}"
         if now - self._last_frame > self._timeout():
             why = "damaged or lost packets, no sound picture" if self._n_held else "no key frame"
@@ -361,6 +368,9 @@ class LiveFrames:
                 self._spacings.append(passed)
             return index
         if not self._spacings:
+            return index
+        # A sender that was off has lost nothing meanwhile.
+        if self._clock.is_anew:
             return index
         missing = max(0, round(passed / statistics.median(self._spacings)) - step)
         self._frame_counter.skip(missing)
