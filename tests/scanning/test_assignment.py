@@ -102,6 +102,23 @@ def test_lines_that_might_be_their_neighbours_are_ambiguous() -> None:
     assert measured(FEW, EASY)
 
 
+@pytest.mark.parametrize("distance", [0.6, 2.6, 3.4])
+def test_a_wall_out_of_range_is_not_read_as_the_next_lasers(distance: float) -> None:
+    """The third stripe of the far wall lies where no laser of three is searched for."""
+    fan = Fan(n_lines=3, spacing_deg=12.0, baseline=(-0.16, 0.0, 0.0), aim_deg=14.0, roll_deg=0.0)
+    rig, wall = fan_rig(fan, (0.25, 1.3)), Plane.from_normal((0.1, 1.0, 0.05), distance)
+    found = Scanner(rig).measure(0, 0.0, peaks_of(rig, [(wall, everywhere)], 0.1)).posture
+    if distance < rig.working_range[1]:
+        assert isinstance(found, Posture)
+        assert found.range == pytest.approx(wall.offset, rel=0.01)
+    else:
+        assert isinstance(found, Refusal)
+        assert found.reason is Reason.AMBIGUOUS
+        # Lines of sight do not quite meet the camera's centre.
+        beyond = float(found.detail.split()[5])
+        assert beyond == pytest.approx(wall.offset, rel=0.02)
+
+
 def test_light_that_must_be_there_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the count of dark lasers and of foreign light, only residuals are left."""
     fan = Fan(n_lines=5, spacing_deg=2.0)

@@ -185,8 +185,9 @@ class AssignmentTest:
         self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.bool_)
         self._bands = sample_bands(laser_bands, triangulator, CELL_LINES)
         self._sheets = [Plane(row[:3], float(row[3])) for row in triangulator.planes]
-        fans = [_in_order(self._sheets, self._along_x, axis) for axis in (True, False)]
-        self.fans = [fan for fan in fans if len(fan) > _FEW]
+        rows = [_in_order(self._sheets, self._along_x, axis) for axis in (True, False)]
+        self._rows = [row for row in rows if len(row) >= _FEW]
+        self.fans = [row for row in rows if len(row) > _FEW]
 
     def is_by_chance(
         self, linked: LinkedCandidates, surfaces: Sequence[Surface], target: Surface
@@ -378,7 +379,7 @@ class AssignmentTest:
         if not target.is_mesh:
             return False
         laser = subsegments.laser[target.members]
-        if not any(self._may_be_beyond(target.plane, fan, laser) for fan in self.fans):
+        if not any(self._beyond(target.plane, fan, laser) for fan in self.fans):
             return False
         visible, _, _, n_shown = self._visibility(target, subsegments)
         if visible < _ODDS.filled:
@@ -386,12 +387,32 @@ class AssignmentTest:
         behind = (one for one in surfaces if one.is_mesh and _is_nearer(target, one, subsegments))
         return any(self._visibility(one, subsegments)[3] > n_shown for one in behind)
 
-    def _may_be_beyond(self, plane: Plane, fan: IntArray, laser: IntArray) -> bool:
-        """Return whether stripes of a fan, read as the next lasers', show a plane out of range."""
+    def beyond(self, subsegments: Subsegments, target: Surface) -> Plane | None:
+        """Return a plane out of range whose stripes may have made the target, if there is one.
+
+        The target lacks lasers that should be visible on it, among them the first or last of three
+        or more in a row. Read as the next lasers', the stripes of the others are those of a surface
+        so far away that one more stripe lies where it is not searched for.
+        """
+        if not self.is_faint(target, subsegments):
+            return None
+        laser = subsegments.laser[target.members]
+        found = (self._beyond(target.plane, row, laser, lacks_last=True) for row in self._rows)
+        return next((one for one in found if one is not None), None)
+
+    def _beyond(
+        self, plane: Plane, row: IntArray, laser: IntArray, *, lacks_last: bool = False
+    ) -> Plane | None:
+        """Return the plane out of range that stripes of a row show, read as the next lasers'.
+
+        `lacks_last`: only if the last laser, which no stripe can be read from, is not on the plane.
+        """
         # Lines of sight do not quite meet, so that the plane is known to a twentieth only.
         known = 0.95
         nearest, farthest = known * self._searched[1], _ODDS.max_lit * self._searched[1]
-        for one_way in (fan, fan[::-1]):
+        for one_way in (row, row[::-1]):
+            if lacks_last and one_way[-1] in laser:
+                continue
             is_lit = np.isin(one_way[:-1], laser)
             sheets = [self._sheets[i] for i in one_way[:-1][is_lit]]
             read_as = [self._sheets[i] for i in one_way[1:][is_lit]]
@@ -399,8 +420,8 @@ class AssignmentTest:
             if other is None:
                 continue
             if nearest <= other.offset <= farthest and other.normal[1] >= MIN_FACING:
-                return True
-        return False
+                return other
+        return None
 
     def _light_share(
         self, linked: LinkedCandidates, surfaces: Sequence[Surface], surface: Surface

@@ -202,6 +202,9 @@ class TargetSelector:
                 "show another if each stripe were the other laser's"
             )
             return Refusal(Reason.AMBIGUOUS, detail)
+        beyond = assignment.beyond(linked.subsegments, target)
+        if beyond is not None:
+            return _ambiguous(target.plane, beyond)
         others = assignment.other_lines(linked, surfaces, target, has_colour=has_colour)
         if others is not None:
             detail = (
