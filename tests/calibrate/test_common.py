@@ -11,6 +11,7 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.rigfile import save_rig
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.simulation.scenarios import example_rig
 
 
@@ -29,6 +30,13 @@ def test_a_nominal_file(tmp_path):
     assert isinstance(nominal.housing, Dome)
     assert nominal.housing.inner_radius == pytest.approx(0.04425, rel=1e-12)
     assert nominal.housing.n_acrylic == 1.48
+
+
+def test_a_nominal_file_states_the_shutter_as_a_rig_file_does(tmp_path):
+    path = tmp_path / "nominal.yaml"
+    path.write_text("camera: {shutter: {kind: interlaced, readout_ms: 20, first_field: bottom}}\n")
+    shutter = Shutter(kind=ShutterKind.INTERLACED, readout=0.02, first_field="bottom")
+    assert load_nominal(path).shutter == shutter
 
 
 def test_a_rig_file_serves_too(tmp_path):
@@ -62,6 +70,7 @@ def test_a_rig_says_what_its_lasers_agree_on(tmp_path, wavelengths, common):
         ("lasers: {count: 3, wavelength_nm: 5320}", "lasers.wavelength_nm is 5320"),
         ("working_range_mm: [900, 300]", "working_range_mm is [900, 300]"),
         ("working_range_mm: [0.3, 0.9]", "write [300, 900] if metres are meant"),
+        ("camera: {shutter: {kind: rolling}}", "camera.shutter.readout_ms is missing or 0"),
         ("just words", "is not a nominal rig"),
     ],
 )

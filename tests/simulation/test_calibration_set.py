@@ -16,6 +16,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
 from aqualvs.simulation.cameras import simulated_camera
@@ -40,6 +41,7 @@ def test_boards_before_a_flat_port_are_in_water_at_their_true_poses(tmp_path):
         rig,
         lasers=tuple(replace(laser, wavelength_nm=650.0) for laser in rig.lasers),
         housing=FlatPort(0.012, 0.005, 1.49, 0.01, -0.01),
+        shutter=Shutter(kind=ShutterKind.ROLLING, readout=0.025, exposure=0.005),
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
     )
     size = SetSize(camera=1, dome=2, box=1, index=1, dive=0)
@@ -48,6 +50,7 @@ def test_boards_before_a_flat_port_are_in_water_at_their_true_poses(tmp_path):
     assert files.poses is None
     nominal = load_nominal(files.nominal)
     assert nominal.wavelength_nm == 650.0
+    assert nominal.shutter == rig.shutter
     port = nominal.housing
     assert port == replace(rig.flat_port, tilt_x=0.0, tilt_y=0.0)
     board = load_board(files.rail_board)

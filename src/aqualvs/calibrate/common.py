@@ -29,8 +29,8 @@ from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Housing
 from aqualvs.optics.rig import Rig, RigUncertainty, common_wavelength
-from aqualvs.optics.rigfile import housing_of, keep_dated, load_rig, save_rig
-from aqualvs.optics.rigschema import LaserWavelength, range_fault
+from aqualvs.optics.rigfile import housing_of, keep_dated, load_rig, save_rig, shutter_from_part
+from aqualvs.optics.rigschema import LaserWavelength, ShutterPart, range_fault
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR
 from aqualvs.report.calibration_material import (
@@ -91,6 +91,10 @@ class _Image(_Section):
     height: _Count
 
 
+class _Camera(_Section):
+    shutter: ShutterPart = ShutterPart()
+
+
 class _Dome(_Section):
     inner_radius_mm: Positive
     thickness_mm: NotNegative
@@ -111,6 +115,7 @@ class _Lasers(_Section):
 class _NominalFile(_Section):
     name: str = "rig"
     image: _Image | None = None
+    camera: _Camera = _Camera()
     dome: _Dome | None = None
     flat: _Flat | None = None
     n_air: Index = N_AIR
@@ -156,6 +161,7 @@ def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
         raise RigError(f"{path}: {said}")
     try:
         housing = housing_of(file.dome, file.flat)
+        shutter = shutter_from_part(file.camera.shutter)
     except RigError as fault:
         raise RigError(f"{path}: {fault}") from None
     return Nominal(
@@ -166,6 +172,7 @@ def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
         n_lasers=None if file.lasers is None else file.lasers.count,
         wavelength_nm=None if file.lasers is None else file.lasers.wavelength_nm,
         working_range=(near_mm / 1e3, far_mm / 1e3),
+        shutter=shutter,
     )
 
 

@@ -83,7 +83,8 @@ def camera(
     nominal: Annotated[
         Path | None,
         Option(
-            help="Nominal values: a rig file, or a file with name, dome, lasers, working range."
+            help="Nominal values: a rig file, or a file with name, dome, shutter, lasers, working "
+            "range."
         ),
     ] = None,
     model: Annotated[Literal["opencv", "fisheye"], Option(help="Distortion model.")] = "opencv",

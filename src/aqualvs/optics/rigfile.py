@@ -502,18 +502,21 @@ def _camera_mapping(rig: Rig) -> dict[str, Any]:
         # Adding zero turns -0.0 into 0.0.
         "rotation_deg": [round(float(value), _ROTATION_DECIMALS) + 0.0 for value in turn],
     }
-    shutter = rig.shutter
-    if shutter != AT_ONCE:
-        # Without those keys that say nothing about its kind.
-        keys: dict[str, Any] = {"kind": shutter.kind.value}
-        content["shutter"] = keys
-        if shutter.readout != 0.0:
-            keys["readout_ms"] = _to_milli(shutter.readout)
-        if shutter.exposure > 0.0:
-            keys["exposure_ms"] = _to_milli(shutter.exposure)
-        if shutter.is_interlaced:
-            keys["first_field"] = shutter.first_field
+    if rig.shutter != AT_ONCE:
+        content["shutter"] = shutter_mapping(rig.shutter)
     return content
+
+
+def shutter_mapping(shutter: Shutter) -> dict[str, Any]:
+    """Return a file's `camera.shutter`, without those keys that say nothing about its kind."""
+    keys: dict[str, Any] = {"kind": shutter.kind.value}
+    if shutter.readout != 0.0:
+        keys["readout_ms"] = _to_milli(shutter.readout)
+    if shutter.exposure > 0.0:
+        keys["exposure_ms"] = _to_milli(shutter.exposure)
+    if shutter.is_interlaced:
+        keys["first_field"] = shutter.first_field
+    return keys
 
 
 def _laser_mapping(laser: Laser) -> dict[str, Any]:

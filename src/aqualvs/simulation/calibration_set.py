@@ -13,7 +13,8 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, common_wavelength
-from aqualvs.optics.rigfile import save_rig
+from aqualvs.optics.rigfile import save_rig, shutter_mapping
+from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
@@ -66,7 +67,7 @@ class CalibrationFiles:
     Attributes
     ----------
     nominal : Path
-        Nominal rig: name, size of the pictures, dome, number of lasers.
+        Nominal rig: name, size of the pictures, shutter, dome, number of lasers.
     camera, dome, box, index : Path
         Folders of pictures.
     board, rail_board, box_file, target : Path
@@ -366,6 +367,8 @@ def _nominal_mapping(rig: Rig) -> dict[str, Any]:
         "name": rig.name,
         "image": {"width": int(rig.size_px[0]), "height": int(rig.size_px[1])},
     }
+    if rig.shutter != AT_ONCE:
+        content["camera"] = {"shutter": shutter_mapping(rig.shutter)}
     if rig.dome is not None:
         content["dome"] = {
             "inner_radius_mm": targets.to_mm(rig.dome.inner_radius),
