@@ -123,6 +123,7 @@ class _NominalFile(_Section):
     working_range_mm: Annotated[list[Positive], Field(min_length=2, max_length=2)] = Field(
         default=[250.0, 1300.0]
     )
+    # No calibration reads it: files that describe the whole camera state it.
     fps: Positive | None = None
 
 
