@@ -33,7 +33,7 @@ def calibrated(tmp_path_factory):
     """A simulated set, what every command said, and where the rig is."""
     out = tmp_path_factory.mktemp("calibration")
     files = simulate_calibration(small_rig(), out, size=SIZE)
-    commands = calibration_commands(files, out, 3)
+    commands = calibration_commands(files, out, small_rig())
     # The camera's, dome's and lasers' steps; one picture does not tell the water's index.
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
@@ -226,7 +226,7 @@ def test_the_whole_way_behind_a_flat_port_ends_at_the_true_range(tmp_path, monke
     truth = replace(small_rig(), housing=port, dome_from_cam=pose)
     size = SetSize(camera=6, dome=6, box=2, index=1, dive=2)
     files = simulate_calibration(truth, tmp_path, size=size)
-    for command in calibration_commands(files, tmp_path, 3)[:3]:
+    for command in calibration_commands(files, tmp_path, truth)[:3]:
         assert main(command) == 0
     rig = load_rig(tmp_path / "rig.yaml")
     sigmas = rig_uncertainty(rig).sigmas

@@ -1,17 +1,23 @@
 """The try-out dive `net_holes`: its log and truth agree with its scenes, and its holes are found.
 
+With it: the commands that a simulated set of calibration pictures comes with.
+
 Scans come from the true lit points instead of pictures, which would take minutes to render.
 """
 
 import csv
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from aqualvs.cli.main import main
 from aqualvs.experiments import simulate as body
+from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.results.folder import RunOutputs
+from aqualvs.simulation.calibration_set import CalibrationFiles
 from aqualvs.simulation.dive import (
     LEAD_S,
     NET_BEARING,
@@ -85,6 +91,22 @@ def test_simulate_writes_log_and_holes_beside_a_dive_along_a_net(tmp_path, capsy
     assert {name: float(hole[name]) for name in expected} == pytest.approx(expected)
     said = capsys.readouterr().out
     assert f"aqualvs net {out / 'run'} --log {out / 'vehicle.csv'} --log-offset-s 20" in said
+
+
+@pytest.fixture
+def files():
+    """Names of a simulated set, of which nothing is rendered."""
+    paths = {field.name: Path("out", field.name) for field in fields(CalibrationFiles)}
+    return CalibrationFiles(**{**paths, "n_pictures": 43})
+
+
+@pytest.mark.parametrize("model", list(LensModel))
+def test_the_camera_s_step_names_the_model_of_a_fisheye_lens(files, model):
+    rig = example_rig()
+    rig = replace(rig, lens=replace(rig.lens, model=model))
+    camera = body.calibration_commands(files, Path("out"), rig)[0]
+    assert camera[:2] == ["calibrate", "camera"]
+    assert ("--model fisheye" in " ".join(camera)) == (model is LensModel.FISHEYE)
 
 
 def test_the_holes_of_the_try_out_are_found_where_they_are(scenario, log_file, tmp_path):

@@ -7,6 +7,8 @@ from dataclasses import astuple, replace
 from pathlib import Path
 
 from aqualvs.errors import OptionError
+from aqualvs.optics.lens import LensModel
+from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.results.files import Claim, writing
@@ -154,7 +156,7 @@ def _simulate_calibration(
             echo(f"{early}; complete in {out}: {', '.join(complete) or 'nothing'}")
             return stop.exit_code
     echo(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
-    _echo_commands(calibration_commands(files, out, len(rig.lasers)), echo)
+    _echo_commands(calibration_commands(files, out, rig), echo)
     return 0
 
 
@@ -165,23 +167,25 @@ def _echo_commands(commands: Iterable[Sequence[str]], echo: Echo) -> None:
         echo(f"  aqualvs {shlex.join(command)}")
 
 
-def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
+def calibration_commands(files: CalibrationFiles, out: Path, rig: Rig) -> list[list[str]]:
     """Return the arguments of the `aqualvs` commands that calibrate from a simulated set.
 
-    `out`: folder for `rig.yaml` and `run`. `n_lasers`: number of lasers of the rig.
+    `out`: folder for `rig.yaml` and `run`. `rig`: the true one.
     """
-    rig = str(out / "rig.yaml")
-    update = ["--rig", rig, "-o", rig]
-    camera = [str(files.camera), f"--board={files.board}", f"--nominal={files.nominal}", "-o", rig]
+    file = str(out / "rig.yaml")
+    update = ["--rig", file, "-o", file]
+    model = [] if rig.lens.model is LensModel.OPENCV else ["--model", rig.lens.model.value]
+    known = [f"--board={files.board}", f"--nominal={files.nominal}", *model]
+    camera = [str(files.camera), *known, "-o", file]
     poses = ["--medium=water"] if files.poses is None else [f"--poses={files.poses}"]
     dome = [str(files.dome), f"--board={files.rail_board}", *poses, *update]
-    lasers = [str(files.box), f"--box={files.box_file}", f"--lasers={n_lasers}", *update]
+    lasers = [str(files.box), f"--box={files.box_file}", f"--lasers={len(rig.lasers)}", *update]
     water = [str(files.index), f"--target={files.target}", *update]
     steps = {"camera": camera, "dome": dome, "lasers": lasers, "water": water}
     commands = [["calibrate", step, *arguments] for step, arguments in steps.items()]
-    commands.append(["check", rig, "--against", str(files.rig)])
+    commands.append(["check", file, "--against", str(files.rig)])
     if files.dive is not None:
-        dive = [str(files.dive), "--rig", rig, "--truth", str(files.dive_truth)]
+        dive = [str(files.dive), "--rig", file, "--truth", str(files.dive_truth)]
         commands.append(["run", *dive, "-o", str(out / "run")])
     return commands
 

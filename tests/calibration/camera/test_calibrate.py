@@ -180,6 +180,12 @@ def test_tells_where_the_picture_was_not_covered() -> None:
     assert "the intrinsics are uncertain by" in text
 
 
+def test_where_the_model_does_not_reach_a_fisheye_model_is_named() -> None:
+    found = camera(_shots(FISHEYE, seed=5, n=10), SIZE)
+    text = "\n".join(found.findings)
+    assert "does not reach all corners of the picture; try --model fisheye" in text
+
+
 def test_coverage_counts_border_pixels() -> None:
     corners = np.array([[-0.5, -0.5], [719.4, 575.4], [719.4, 0.0]])
     counts = coverage(corners, SIZE)

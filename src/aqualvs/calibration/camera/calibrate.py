@@ -377,7 +377,8 @@ def _weak_places(result: CameraCalibration) -> list[str]:
     grid = pixel_grid(result.size_px)
     sigma = direction_sigma_px(result.lens, result.uncertainty.covariance, grid)
     if not np.isfinite(sigma).all():
-        lines.append("the distortion model does not reach all corners of the picture")
+        remedy = "" if result.lens.model is LensModel.FISHEYE else "; try --model fisheye"
+        lines.append(f"the distortion model does not reach all corners of the picture{remedy}")
     worst = int(np.argmax(np.nan_to_num(sigma)))
     if sigma[worst] > weak_pixel_px:
         u, v = grid[worst]
