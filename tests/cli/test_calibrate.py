@@ -210,8 +210,9 @@ def test_the_functions_find_what_the_commands_find(calibrated):
 def test_the_function_of_the_water_says_what_it_needs(calibrated):
     out, files, _, _ = calibrated
     pictures = sorted(files.index.rglob("*.png"))
-    with pytest.raises(aqualvs.AqualvsError, match="the index is known to"):
+    with pytest.raises(aqualvs.AqualvsError, match="the index is known to") as refused:
         aqualvs.calibrate_water(pictures, files.target, load_rig(out / "rig.yaml"))
+    assert str(refused.value).endswith("or give --temperature-c and --salinity")
     prior = IndexPrior.seawater(15.0, 35.0, n_air=1.0003)
     done = aqualvs.calibrate_water(pictures, files.target, out / "rig.yaml", prior=prior)
     assert "n_water" in done.uncertainty.names

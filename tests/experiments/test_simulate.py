@@ -27,7 +27,10 @@ from aqualvs.simulation.dive import (
 )
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.vehicle_logs import VehiclePlaces, read_vehicle_log
+from aqualvs.yamlfile import yaml_text
 from net_cases import NetCamera
+
+MEASURED = ["--temperature-c=4", "--salinity=30.5"]
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +110,33 @@ def test_the_camera_s_step_names_the_model_of_a_fisheye_lens(files, model):
     camera = body.calibration_commands(files, Path("out"), rig)[0]
     assert camera[:2] == ["calibrate", "camera"]
     assert ("--model fisheye" in " ".join(camera)) == (model is LensModel.FISHEYE)
+
+
+@pytest.mark.parametrize(
+    ("water", "wavelength_nm", "steps"),
+    [
+        ({"n": 1.34}, 640, {}),
+        ({"temperature_c": 4, "salinity_permille": 30.5}, 532, {"water": MEASURED}),
+        # The plate shows the index of green light.
+        ({"temperature_c": 4, "salinity_permille": 30.5}, 640, {"run": MEASURED}),
+    ],
+)
+def test_measured_water_goes_to_the_step_that_takes_it(
+    files, tmp_path, monkeypatch, capsys, water, wavelength_nm, steps
+):
+    rig = rig_to_mapping(example_rig()) | {"water": water}
+    rig["lasers"] = [{**laser, "wavelength_nm": wavelength_nm} for laser in rig["lasers"]]
+    (tmp_path / "rig.yaml").write_text(yaml_text(rig))
+    monkeypatch.setattr(body, "simulate_calibration", lambda *_, **__: files)
+    arguments = ["calibration", "--rig", str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "out")]
+    assert main(["simulate", *arguments]) == 0
+    commands = [
+        line.split() for line in capsys.readouterr().out.splitlines() if " aqualvs " in line
+    ]
+    told = {line[2] if line[1] == "calibrate" else line[1]: line for line in commands}
+    assert ("water" in told) == ("run" not in steps)
+    found = {step: [word for word in line if word in MEASURED] for step, line in told.items()}
+    assert {step: words for step, words in found.items() if words} == steps
 
 
 def test_the_holes_of_the_try_out_are_found_where_they_are(scenario, log_file, tmp_path):

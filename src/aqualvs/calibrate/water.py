@@ -109,12 +109,9 @@ def calibrate_water(
     )
     if not result.observable and not any(reading.prior_used for reading in result.readings):
         why = "; ".join(result.remarks) or (
-            "the lens is too near the centre of the dome; give temperature and salinity"
+            "the lens is too near the centre of the dome; give --temperature-c and --salinity"
         )
-        raise CalibrationError(
-            f"the index is known to {result.sigma:.2g} only: {why}; see --temperature-c "
-            "and --salinity"
-        )
+        raise CalibrationError(f"the index is known to {result.sigma:.2g} only: {why}")
     return common.Calibration(
         rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,

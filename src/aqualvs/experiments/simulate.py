@@ -6,10 +6,12 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
 
-from aqualvs.errors import OptionError
+from aqualvs.calibration.water_index.state import IndexPrior
+from aqualvs.errors import OptionError, RigError
 from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.rigschema import parse_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.results.files import Claim, writing
 from aqualvs.simulation.calibration_set import (
@@ -31,6 +33,7 @@ from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scena
 from aqualvs.simulation.scene import CameraSensor
 from aqualvs.terminal import Echo, StopSignals, Tick, progress
 from aqualvs.text import count_text
+from aqualvs.yamlfile import read_yaml
 
 CALIBRATION = "calibration"
 """Argument, instead of a scenario, for pictures for a calibration."""
@@ -156,7 +159,7 @@ def _simulate_calibration(
             echo(f"{early}; complete in {out}: {', '.join(complete) or 'nothing'}")
             return stop.exit_code
     echo(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
-    _echo_commands(calibration_commands(files, out, rig), echo)
+    _echo_commands(calibration_commands(files, out, rig, _seawater(rig_file)), echo)
     return 0
 
 
@@ -167,10 +170,26 @@ def _echo_commands(commands: Iterable[Sequence[str]], echo: Echo) -> None:
         echo(f"  aqualvs {shlex.join(command)}")
 
 
-def calibration_commands(files: CalibrationFiles, out: Path, rig: Rig) -> list[list[str]]:
+def _seawater(rig_file: Path | None) -> tuple[float, float] | None:
+    """Return the temperature, in °C, and salinity, in per mille, by which a file gives the water.
+
+    None if it gives the index instead.
+    """
+    if rig_file is None:
+        return None
+    water = parse_rig(read_yaml(rig_file, "a rig file", RigError), str(rig_file)).water
+    if water is None or water.temperature_c is None or water.salinity_permille is None:
+        return None
+    return water.temperature_c, water.salinity_permille
+
+
+def calibration_commands(
+    files: CalibrationFiles, out: Path, rig: Rig, seawater: tuple[float, float] | None = None
+) -> list[list[str]]:
     """Return the arguments of the `aqualvs` commands that calibrate from a simulated set.
 
-    `out`: folder for `rig.yaml` and `run`. `rig`: the true one.
+    `out`: folder for `rig.yaml` and `run`. `rig`: the true one. `seawater`: temperature, in
+    °C, and salinity, in per mille, of its water, if they are known.
     """
     file = str(out / "rig.yaml")
     update = ["--rig", file, "-o", file]
@@ -180,14 +199,29 @@ def calibration_commands(files: CalibrationFiles, out: Path, rig: Rig) -> list[l
     poses = ["--medium=water"] if files.poses is None else [f"--poses={files.poses}"]
     dome = [str(files.dome), f"--board={files.rail_board}", *poses, *update]
     lasers = [str(files.box), f"--box={files.box_file}", f"--lasers={len(rig.lasers)}", *update]
-    water = [str(files.index), f"--target={files.target}", *update]
-    steps = {"camera": camera, "dome": dome, "lasers": lasers, "water": water}
+    steps = {"camera": camera, "dome": dome, "lasers": lasers}
+    measured = []
+    if seawater is not None:
+        measured = [f"--temperature-c={seawater[0]:g}", f"--salinity={seawater[1]:g}"]
+    is_green = seawater is None or _is_of_green_light(rig, seawater)
+    if is_green:
+        steps["water"] = [str(files.index), f"--target={files.target}", *measured, *update]
     commands = [["calibrate", step, *arguments] for step, arguments in steps.items()]
     commands.append(["check", file, "--against", str(files.rig)])
     if files.dive is not None:
         dive = [str(files.dive), "--rig", file, "--truth", str(files.dive_truth)]
-        commands.append(["run", *dive, "-o", str(out / "run")])
+        water = [] if is_green else measured
+        commands.append(["run", *dive, *water, "-o", str(out / "run")])
     return commands
+
+
+def _is_of_green_light(rig: Rig, seawater: tuple[float, float]) -> bool:
+    """Return whether the index of a rig's water is that of green light.
+
+    `calibrate water` expects that index; for lasers of another colour, `run` computes theirs.
+    """
+    green = IndexPrior.seawater(*seawater, n_air=rig.n_air)
+    return abs(rig.n_water - green.n) < 3.0 * green.sigma
 
 
 def print_scenarios(echo: Echo) -> None:

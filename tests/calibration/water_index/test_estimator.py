@@ -272,7 +272,9 @@ def test_what_is_unobservable_for_the_plates_sake_is_said_otherwise() -> None:
     vehicle = Vehicle(np.random.default_rng(13), rig=decentred((0.5, 6.0, 0.3)))
     last = vehicle.film(vehicle.estimator(), [1.34] * 3)[-1]
     assert not last.observable
-    assert "measure them better" in last.remarks[0]
+    assert last.remarks[0].endswith(
+        "measure them better, begin with pictures in air, or give --temperature-c and --salinity"
+    )
     last = vehicle.film(vehicle.estimator(IndexPrior(1.34, 2e-4)), [1.34] * 3)[-1]
     assert not last.observable
     assert last.prior_used

@@ -324,7 +324,7 @@ class IndexEstimator:
                 lens = f"the lens is {decentring * 1e3:.1f} mm from the dome's centre, "
             return (
                 f"unobservable: {lens}so the picture of the target hardly moves with the index; "
-                "give temperature and salinity"
+                "give --temperature-c and --salinity"
             )
         if self.prior is not None and not self._contradicted:
             return (
@@ -334,7 +334,7 @@ class IndexEstimator:
         return (
             f"unobservable: the uncertainty of the target's position and of the camera leaves the "
             f"index uncertain by {own.sigma:.1e}; measure them better, begin with pictures in "
-            "air, or give temperature and salinity; changes are still detected"
+            "air, or give --temperature-c and --salinity"
         )
 
     def _about_prior(self, own: IndexState | None) -> str:
