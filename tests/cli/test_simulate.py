@@ -6,6 +6,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 
 import av
@@ -15,7 +16,7 @@ from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import CALIBRATION
 from aqualvs.optics.rigfile import load_rig, save_rig
-from aqualvs.optics.shutter import AT_ONCE
+from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.simulation import dive as dive_of
 from aqualvs.simulation.calibration_set import SetSize
 from aqualvs.simulation.cameras import CAMERAS
@@ -26,6 +27,8 @@ from complaints import complaints
 from panel_cases import small_rig
 from shell_cases import rig_file
 from waiting import TIMEOUT_S, until
+
+INTERLACED = Shutter(kind=ShutterKind.INTERLACED, readout=0.02)
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +61,35 @@ def test_bad_input_gives_one_line(arguments, words, refused, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     assert words in refused("simulate", *arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["wall", "calibration"])
+@pytest.mark.parametrize(
+    ("size_px", "shutter", "written"),
+    [
+        ((361, 289), AT_ONCE, "needs even sides; write 362x290"),
+        ((360, 290), INTERLACED, "a height that 4 divides; write 360x292"),
+    ],
+)
+def test_a_size_that_no_video_holds_is_refused_before_rendering(
+    tmp_path, refused, what, size_px, shutter, written
+):
+    rig, out = tmp_path / "odd.yaml", tmp_path / "out"
+    save_rig(replace(small_rig(), size_px=size_px, shutter=shutter), rig)
+    said = refused("simulate", what, "--rig", rig, "-o", out)
+    assert f"{rig}: image is {size_px[0]}x{size_px[1]} px" in said
+    assert written in said
+    assert not out.exists()
+
+
+def test_a_shutter_too_slow_for_the_dive_of_a_set_is_refused_before_rendering(tmp_path, refused):
+    rig, out = tmp_path / "slow.yaml", tmp_path / "out"
+    slow = Shutter(kind=ShutterKind.ROLLING, readout=0.06)
+    save_rig(replace(small_rig(), shutter=slow), rig)
+    assert "takes 60 ms for a picture" in refused(
+        "simulate", "calibration", "--rig", rig, "-o", out
+    )
+    assert not out.exists()
 
 
 def test_the_help_names_every_camera(capsys):

@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from aqualvs.errors import OutputError
+from aqualvs.errors import OptionError, OutputError
 from aqualvs.simulation.dive import simulate_dive
 from aqualvs.simulation.scenario import Course, Trajectory
 from aqualvs.simulation.scenarios import example_rig, load_scenario
@@ -122,6 +122,13 @@ def test_the_same_scenario_gives_the_same_dive(tmp_path):
         with av.open(str(files.video)) as container:
             pictures.append([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
     assert np.array_equal(pictures[0], pictures[1])
+
+
+def test_a_size_that_no_video_holds_leaves_no_files(tmp_path):
+    rig = replace(_small_rig(), size_px=(181, 144))
+    with pytest.raises(OptionError, match=r"rig example: image is 181x144 px.*write 182x144"):
+        simulate_dive(load_scenario("wall"), rig, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_in_the_way_of_the_folder_is_named(tmp_path):

@@ -129,6 +129,31 @@ def test_senseless_options_are_refused(tmp_path, options):
         VideoWriter(tmp_path / "a.mp4", **given)
 
 
+@pytest.mark.parametrize(
+    ("size_px", "first_field", "codec", "written"),
+    [
+        ((63, 48), None, "h264", "64x48"),
+        ((64, 49), None, "h264", "64x50"),
+        ((64, 50), "top", "h264", "64x52"),
+        ((63, 48), "bottom", "h264", "64x48"),
+        ((64, 50), None, "h264", None),
+        ((63, 49), "top", "lossless", None),
+        ((63, 49), None, "mjpeg", None),
+    ],
+)
+def test_a_size_that_420_video_cannot_hold_is_refused_with_the_next(
+    tmp_path, size_px, first_field, codec, written
+):
+    path, recording = tmp_path / "a.mp4", Compression(codec=codec)
+    if written is not None:
+        with pytest.raises(OptionError, match=rf"size is {size_px[0]}x.*; write {written}$"):
+            VideoWriter(path, size_px, 25.0, recording, first_field=first_field)
+        size_px = tuple(map(int, written.split("x")))
+    with VideoWriter(path, size_px, 25.0, recording, first_field=first_field) as writer:
+        writer.write(np.zeros((size_px[1], size_px[0], 3), np.uint8))
+    assert path.stat().st_size > 0
+
+
 def test_a_folder_that_does_not_exist_is_named(tmp_path):
     path = tmp_path / "none" / "a.mp4"
     with pytest.raises(OutputError, match="none"):

@@ -17,13 +17,14 @@ from aqualvs.results.files import Claim, writing
 from aqualvs.simulation.calibration_set import (
     CalibrationFiles,
     SetSize,
+    check_set,
     port_folder,
     simulate_calibration,
 )
 from aqualvs.simulation.cameras import SimulatedCamera, simulated_camera
 from aqualvs.simulation.dive import (
     LEAD_S,
-    check_shutter,
+    check_dive,
     shutter_from_words,
     simulate_dive,
     write_hole_truth,
@@ -84,7 +85,7 @@ def simulate(
     elif course.shutter is not None:
         place = f"scenario {scenario}: shutter"
         rig = replace(rig, shutter=shutter_from_words(course.shutter, course.fps, place))
-    check_shutter(rig.shutter, course.fps)
+    check_dive(rig, course.fps, model.recording, rig_file)
     claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
     video, truth = out / "dive.mp4", out / "truth.csv"
     with claim, writing(out), StopSignals() as stop, progress(scenario, course.n_frames) as tick:
@@ -137,12 +138,12 @@ def _simulate_calibration(
     rig_file: Path | None, out: Path, echo: Echo, *, camera: SimulatedCamera, overwrite: bool
 ) -> int:
     """Render the pictures of a calibration and print the commands that use them."""
-    rig = example_rig() if rig_file is None else load_rig(rig_file)
+    rig, size = example_rig() if rig_file is None else load_rig(rig_file), SetSize()
+    check_set(rig, size, camera, rig_file)
     # In the order in which they are rendered.
     folders = ("camera_air", port_folder(rig), "box", "index", "dive")
     files_of_set = [out / name for name in (*folders, "truth", "nominal.yaml")]
     claim = Claim("simulate", files_of_set, overwrite=overwrite)
-    size = SetSize()
     # A folder is complete when the picture after its last one begins: files follow its pictures.
     ends = dict(zip(folders, itertools.accumulate(astuple(size)), strict=True))
     with (

@@ -18,7 +18,7 @@ from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
-from aqualvs.simulation.dive import simulate_dive, writable
+from aqualvs.simulation.dive import check_dive, simulate_dive, writable
 from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, panel_sheets
 from aqualvs.simulation.scenario import parse_scenario
 from aqualvs.simulation.textures import CharucoPrint
@@ -32,6 +32,7 @@ _WATER = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028
 # The nearest board stands this far before the dome.
 _NEAREST = 0.15
 _PLATE_FAR = 0.35
+_DIVE_FPS = 25.0
 
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 
@@ -210,18 +211,25 @@ def simulate_calibration(
     ------
     OptionError
         If the rig has no housing or no lasers, a camera behind a flat port that is not in the
-        frame's origin and straight ahead, or there are too few pictures.
+        frame's origin and straight ahead, there are too few pictures, or the dive's video cannot
+        hold the rig's.
     OutputError
         If the folder or a file cannot be written.
     """
     size, out = SetSize() if size is None else size, Path(out)
-    _check(rig, size)
+    check_set(rig, size, camera)
     job = _Job(rig, out, size, seed, progress, camera)
     with writable(out):
         return _simulate(job)
 
 
-def _check(rig: Rig, size: SetSize) -> None:
+def check_set(
+    rig: Rig, size: SetSize, camera: SimulatedCamera, rig_file: Path | None = None
+) -> None:
+    """Raise `OptionError` as `simulate_calibration` does, before anything is rendered.
+
+    `rig_file`: that of the rig, which messages on its pictures name.
+    """
     if rig.housing is None or not rig.lasers:
         missing = "housing" if rig.housing is None else "lasers"
         raise OptionError(
@@ -239,6 +247,8 @@ def _check(rig: Rig, size: SetSize) -> None:
         )
     if min(size.camera, size.dome, size.box, size.index) < 1 or size.dive < 0:
         raise OptionError(f"{size}: every kind needs one picture at least")
+    if size.dive:
+        check_dive(rig, _DIVE_FPS, camera.recording, rig_file)
 
 
 def _simulate(job: _Job) -> CalibrationFiles:
@@ -344,10 +354,9 @@ def _index(job: _Job) -> tuple[Path, Path]:
 def _dive(job: _Job) -> tuple[Path | None, Path | None]:
     if not job.size.dive:
         return None, None
-    fps = 25.0
     content = {
-        "duration_s": job.size.dive / fps,
-        "fps": fps,
+        "duration_s": job.size.dive / _DIVE_FPS,
+        "fps": _DIVE_FPS,
         "seed": job.seed,
         "motion": {"range_mm": [420, 700], "pitch_deg": [-4, 3], "yaw_deg": [6, -5]},
         "walls": [{}],

@@ -23,7 +23,7 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import TRUTH_COLUMNS, LitPoints, truth_row
-from aqualvs.simulation.video import Compression, VideoWriter
+from aqualvs.simulation.video import Compression, VideoWriter, check_size
 
 NET_BEARING = float(np.deg2rad(65.0))
 """Compass bearing of the view to the net, in radians."""
@@ -155,9 +155,11 @@ def simulate_dive(
     OutputError
         If the folder or a file cannot be written.
     RigError, OptionError
-        If rig, scenario or options make no sense, or a picture takes longer than a frame.
+        If rig, scenario or options make no sense, a picture takes longer than a frame, or the video
+        cannot hold pictures of the rig's size.
     """
-    check_shutter(rig.shutter, scenario.fps)
+    recording = recording or camera.recording
+    check_dive(rig, scenario.fps, recording)
     video, truth = out_dir / "dive.mp4", out_dir / "truth.csv"
     renderer = Renderer(rig, threads=os.cpu_count() or 1, camera=camera)
     with writable(out_dir):
@@ -167,11 +169,7 @@ def simulate_dive(
     with (
         file,
         VideoWriter(
-            video,
-            rig.size_px,
-            scenario.fps,
-            recording or camera.recording,
-            first_field=rig.shutter.field_of(0),
+            video, rig.size_px, scenario.fps, recording, first_field=rig.shutter.field_of(0)
         ) as writer,
     ):
         table = csv.writer(file)
@@ -242,6 +240,16 @@ def check_shutter(shutter: Shutter, fps: float) -> None:
             f"{fps:g} frames a second there are {1e3 / fps:g} ms; lower "
             "fps, or give a faster shutter"
         )
+
+
+def check_dive(rig: Rig, fps: float, recording: Compression, rig_file: Path | None = None) -> None:
+    """Raise `OptionError` if a rig's shutter or the size of its pictures does not suit a video.
+
+    `rig_file`: that of the rig, which the message names.
+    """
+    check_shutter(rig.shutter, fps)
+    place = f"{rig_file or f'rig {rig.name}'}: image"
+    check_size(rig.size_px, recording, rig.shutter.field_of(0), place)
 
 
 def _write_points(path: Path, lit: LitPoints) -> None:

@@ -89,7 +89,9 @@ class VideoWriter(Closing):
         first_field: Field | None = None,
     ) -> None:
         self._recording = Compression() if recording is None else recording
-        _check(size_px, fps, self._recording.codec, first_field)
+        check_size(size_px, self._recording, first_field)
+        if not 0.0 < fps <= 1000.0:
+            raise OptionError(f"fps is {fps:g}; it must lie between 0 and 1000")
         self._path, self._n_frames, self._first_field = path, 0, first_field
         codec = _CODECS.get(self._recording.codec) or _lossy_codec()
         with _writing_video(path, ValueError):
@@ -216,16 +218,23 @@ def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     return data.tobytes()
 
 
-def _check(size_px: tuple[int, int], fps: float, codec: Codec, first_field: Field | None) -> None:
-    if codec == "h264" and first_field is not None and size_px[1] % 4:
-        raise OptionError(
-            f"size is {size_px[0]}x{size_px[1]} px; fields of interlaced 4:2:0 video have even "
-            "heights: choose a height that 4 divides, or lossless"
-        )
-    if codec == "h264" and any(side % 2 for side in size_px):
-        raise OptionError(
-            f"size is {size_px[0]}x{size_px[1]} px; 4:2:0 video needs even sides, or choose "
-            "lossless"
-        )
-    if not 0.0 < fps <= 1000.0:
-        raise OptionError(f"fps is {fps:g}; it must lie between 0 and 1000")
+def check_size(
+    size_px: tuple[int, int], recording: Compression, first_field: Field | None, place: str = "size"
+) -> None:
+    """Raise `OptionError`, which names `place`, if a video cannot hold pictures of this size.
+
+    `recording` and `first_field` are those of `VideoWriter`.
+    """
+    if recording.codec != "h264":
+        return
+    # Chroma has half the rows of the picture, or of each of its fields.
+    sides = (2, 2) if first_field is None else (2, 4)
+    width, height = (-(-side // by) * by for side, by in zip(size_px, sides, strict=True))
+    if (width, height) == tuple(size_px):
+        return
+    needs = "4:2:0 video needs even sides"
+    if first_field is not None:
+        needs = "interlaced 4:2:0 video needs an even width and a height that 4 divides"
+    raise OptionError(
+        f"{place} is {size_px[0]}x{size_px[1]} px, but {needs}; write {width}x{height}"
+    )
