@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 
 from aqualvs.calibration.targets.printed import board_rectangles, marker_rectangles
-from aqualvs.calibration.targets.targets import Board, BoardKind
+from aqualvs.calibration.targets.targets import Board, BoardKind, MarkerSet, View
+from aqualvs.geometry.transforms import SE3
 
 # Finer pixels, per pixel each way, that are averaged: leaves 0.01 px of jaggies at most.
 _FINE = 6
@@ -103,3 +104,30 @@ def truth_of_board(board, h):
     """Pixels of a board's inner corners."""
     _, border = board_cells(board)
     return seen(h, board.corner_points()[:, :2] / board.square * UNITS + border)
+
+
+def index_target():
+    """Six tags of 12 mm on a plate 25 cm ahead, turned by 6 degrees, in `dome`."""
+    corners = [
+        (0.015 * i + a - 0.02, 0.0, 0.015 * j + b - 0.015)
+        for i in range(3)
+        for j in range(2)
+        for a, b in ((0.0, 0.012), (0.012, 0.012), (0.012, 0.0), (0.0, 0.0))
+    ]
+    placed = SE3.from_rotvec((0.0, 0.0, -0.1), (-0.04, 0.25, -0.02)).apply(corners)
+    n_markers = 6
+    return MarkerSet(
+        frame="dome",
+        family="DICT_APRILTAG_36h11",
+        ids=np.arange(n_markers),
+        corners=placed.reshape(n_markers, 4, 3),
+        plane_names=(None,) * n_markers,
+    )
+
+
+def index_view(rig):
+    """View of `index_target` by a rig, without noise."""
+    points = index_target().points()
+    pixels, valid = rig.camera().project(points)
+    assert valid.all()
+    return View("frame", np.arange(len(points)), points, pixels)

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.optics.water import N_AIR, seawater_index, seawater_index_slopes, seawater_index_vacuum
+from aqualvs.optics.water import (
+    N_AIR,
+    Dispersion,
+    index_in_seawater,
+    seawater_index,
+    seawater_index_slopes,
+    seawater_index_vacuum,
+)
 
 SODIUM_NM = 589.3
 
@@ -56,6 +63,26 @@ def test_colder_saltier_and_bluer_water_bends_more() -> None:
     assert (np.diff(seawater_index(np.linspace(0, 30, 31), 35.0)) < 0.0).all()
     assert (np.diff(seawater_index(10.0, np.linspace(0, 40, 41))) > 0.0).all()
     assert (np.diff(seawater_index(10.0, 35.0, np.linspace(400, 700, 61))) < 0.0).all()
+
+
+@pytest.mark.parametrize("light_nm", [405.0, 450.0, 520.0, 640.0, 780.0])
+def test_the_index_for_one_colour_gives_that_for_another_in_any_water(light_nm: float) -> None:
+    light = Dispersion.of(light_nm)
+    for t, s in ((0.0, 0.0), (8.0, 34.0), (30.0, 0.0), (30.0, 40.0)):
+        green, own = (index_in_seawater(t, s, nm, N_AIR) for nm in (None, light_nm))
+        assert abs(light.from_green(green) - own) < min(light.sigma(green, 0.0), 1e-4)
+        assert light.to_green(light.from_green(green)) == pytest.approx(green, abs=1e-15)
+    # The colour in which a target is seen is known to 5 nm, or 2e-4 of the index.
+    assert 1.5e-4 < light.sigma(1.34, 0.0) < 3e-4
+    assert light.sigma(1.34, 1e-3) > light.ratio * 1e-3
+
+
+@pytest.mark.parametrize("light_nm", [None, 532.0])
+def test_green_light_needs_no_conversion_and_air_has_no_dispersion(light_nm: float | None) -> None:
+    assert Dispersion.of(light_nm) == (1.0, 0.0, N_AIR)
+    red = Dispersion.of(640.0, 1.0002)
+    assert red.from_green(1.0002) == 1.0002
+    assert red.sigma(1.0002, 0.0) == 0.0
 
 
 def test_arguments_broadcast() -> None:

@@ -18,6 +18,7 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping
 from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import with_exact_numbers
+from aqualvs.optics.water import Dispersion
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
 from aqualvs.simulation.cameras import simulated_camera
 from panel_cases import small_rig
@@ -58,6 +59,14 @@ def test_boards_before_a_flat_port_are_in_water_at_their_true_poses(tmp_path):
         view = detect_board(picture(files.dome / name), board, name)
         assert isinstance(view, View), view
         check_close(view.pixels, *rig.camera().project(pose.apply(view.points)))
+    # Red lasers have the rig's index; the plate is seen in green light.
+    plate = load_target(files.target)
+    view = detect_markers(picture(files.index / "frame_000.png"), plate, "frame")
+    assert isinstance(view, View), view
+    green = rig.in_water(Dispersion.of(650.0, rig.n_air).to_green(rig.n_water))
+    check_close(view.pixels, *green.camera().project(view.points))
+    by_lasers, _ = rig.camera().project(view.points)
+    assert np.abs(by_lasers - view.pixels).max() > 0.3
 
 
 def picture(path):

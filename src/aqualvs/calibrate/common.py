@@ -64,6 +64,18 @@ N_LASERS = "n_lasers"
 WAVELENGTH_NM = "wavelength_nm"
 """Key of `Rig.solved_from`: wavelength of these lasers, in nanometres."""
 
+
+def lasers_wavelength(rig: Rig) -> float | None:
+    """Return the common wavelength (nm) of a rig's lasers, or, before it has any, the planned one.
+
+    None if they differ or it is unknown.
+    """
+    planned = rig.solved_from.get(WAVELENGTH_NM)
+    if not rig.lasers and isinstance(planned, int | float):
+        return float(planned)
+    return common_wavelength(rig.lasers)
+
+
 _Count = Annotated[int, Field(gt=0)]
 
 

@@ -20,14 +20,7 @@ from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet
 from aqualvs.errors import OptionError
-from aqualvs.optics.rig import (
-    LASER_PARAMETERS,
-    Laser,
-    Rig,
-    RigUncertainty,
-    common_wavelength,
-    merged,
-)
+from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.rigschema import LASER_NM, LASER_NM_REMEDY
 from aqualvs.optics.solved import (
@@ -261,10 +254,7 @@ def _wavelength(given: float | None, rig: Rig) -> float | None:
         if not LASER_NM[0] <= given <= LASER_NM[1]:
             raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
         return given
-    planned = rig.solved_from.get(common.WAVELENGTH_NM)
-    if not rig.lasers and isinstance(planned, int | float):
-        return float(planned)
-    return common_wavelength(rig.lasers)
+    return common.lasers_wavelength(rig)
 
 
 def _planned_count(rig: Rig) -> int | None:

@@ -11,13 +11,14 @@ from aqualvs.calibrate import common
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.targets.target_files import load_target
 from aqualvs.calibration.targets.targets import MarkerSet, View
-from aqualvs.calibration.water_index.estimator import WaterCalibration
+from aqualvs.calibration.water_index.estimator import N_WATER, WaterCalibration
 from aqualvs.calibration.water_index.estimator import calibrate_water as solve_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior
 from aqualvs.errors import CalibrationError, check_options
-from aqualvs.optics.rig import Rig, merged
+from aqualvs.optics.rig import Rig, RigUncertainty, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import SolvedStep, rig_uncertainty, with_step, with_uncertainty
+from aqualvs.optics.water import Dispersion
 from aqualvs.report.calibration_material import (
     CalibrationPage,
     Series,
@@ -99,7 +100,7 @@ def calibrate_water(
         times = None
     else:
         found, times = _found_in(pictures, markers, before, target)
-    result = solve_water(
+    seen = solve_water(
         before,
         found.views,
         times,
@@ -107,13 +108,14 @@ def calibrate_water(
         prior=prior,
         options=options or IndexOptions(),
     )
-    if not result.observable and not any(reading.prior_used for reading in result.readings):
-        why = "; ".join(result.remarks) or (
+    if not seen.observable and not any(reading.prior_used for reading in seen.readings):
+        why = "; ".join(seen.remarks) or (
             "the lens is too near the centre of the dome; give --temperature-c and --salinity"
         )
-        raise CalibrationError(f"the index is known to {result.sigma:.2g} only: {why}")
+        raise CalibrationError(f"the index is known to {seen.sigma:.2g} only: {why}")
+    result = _in_light(seen, common.lasers_wavelength(before))
     return common.Calibration(
-        rig=_solved_rig(before, result),
+        rig=_solved_rig(before, result, seen),
         uncertainty=result.uncertainty,
         residuals_px=result.residuals,
         left_out={**found.missed, **{one.name: one.refused for one in result.readings if not one}},
@@ -145,7 +147,7 @@ def run_water(request: WaterRequest, echo: Echo) -> None:
     echo(f"index {result.n:.5f} ± {result.sigma:.5f} from {pictures}")
     for line in done.notes:
         echo(line)
-    page = _page(done.rig, result, prior, request)
+    page = _page(done, prior, request)
     common.finish(done.rig, page, request.out, "water", echo, request.rig)
 
 
@@ -186,21 +188,47 @@ def _source(request: WaterRequest) -> FrameSource:
     return open_source(first, fps=fps)
 
 
-def _solved_rig(rig: Rig, result: WaterCalibration) -> Rig:
+def _in_light(seen: WaterCalibration, light_nm: float | None) -> WaterCalibration:
+    """Return a result for green light with the index, and its sigma, for a wavelength in nm."""
+    light = Dispersion.of(light_nm, seen.rig.n_air)
+    if light.ratio == 1.0:
+        return seen
+    known, sigma = seen.uncertainty, light.sigma(seen.n, seen.sigma)
+    scale = np.array([light.ratio if name == N_WATER else 1.0 for name in known.names])
+    covariance = known.covariance * np.outer(scale, scale)
+    index = known.names.index(N_WATER)
+    covariance[index, index] = sigma**2
+    remark = (
+        f"the target, seen in green or white light, gives {seen.n:.5f} ± {seen.sigma:.5f}; from "
+        f"it follows the index for the lasers' {light_nm:g} nm, by the dispersion of water"
+    )
+    return replace(
+        seen,
+        rig=seen.rig.in_water(light.from_green(seen.n)),
+        uncertainty=RigUncertainty(known.names, covariance),
+        sigma=sigma,
+        remarks=(remark, *seen.remarks),
+    )
+
+
+def _solved_rig(rig: Rig, result: WaterCalibration, seen: WaterCalibration) -> Rig:
+    """Return the rig with a result; `seen` is that for the light in which the target is seen."""
     counted = [reading for reading in result.readings if reading]
+    of_light = {} if result.n == seen.n else {"n_green": round(seen.n, 6)}
     step = SolvedStep(
         pictures=len(counted),
         points=sum(reading.n_points for reading in counted),
         rms_px=result.rms_px,
-        extras={"n": round(result.n, 6), "observable": result.observable},
+        extras={"n": round(result.n, 6), **of_light, "observable": result.observable},
     )
     uncertainty = merged(rig_uncertainty(rig), result.uncertainty)
     return with_uncertainty(with_step(result.rig, "water", step), uncertainty)
 
 
 def _page(
-    rig: Rig, result: WaterCalibration, prior: IndexPrior | None, request: WaterRequest
+    done: common.Calibration[WaterCalibration], prior: IndexPrior | None, request: WaterRequest
 ) -> CalibrationPage:
+    rig, result = done.rig, done.solution
     counted = [reading for reading in result.readings if reading]
     times = np.array([reading.time for reading in counted])
     random = f"{result.sigma_random:.1e}"

@@ -17,6 +17,8 @@ N_AIR = 1.0003
 """Index of air relative to vacuum, as rig files have it by default."""
 GREEN_NM = 532.0
 """Wavelength of a frequency-doubled Nd:YAG laser in vacuum, nanometres."""
+GREEN_SIGMA_NM = 5.0
+"""Standard deviation of the wavelength in which a target is seen; it changes the index by 2e-4."""
 
 
 # Coefficients n0 to n9 of the formula.
@@ -138,6 +140,55 @@ def water_fault(temperature_c: float | None, salinity_permille: float | None) ->
     return ("", "") if 0.0 < salinity_permille <= _SALTIEST else ("salinity", remedy)
 
 
+class Dispersion(NamedTuple):
+    """Index of water for light of one wavelength, by that for green or white light.
+
+    The ratio of n - n_air at both wavelengths is nearly the same in all water, and in air the
+    indices are equal.
+    """
+
+    ratio: float
+    # Of the ratio, one standard deviation.
+    sigma_ratio: float
+    n_air: float
+
+    @classmethod
+    def of(cls, light_nm: float | None, n_air: float = N_AIR) -> "Dispersion":
+        """Return that of a wavelength, by Quan & Fry (1995); none for green or unknown light.
+
+        Of light beyond the formula's 400 to 700 nm it is that of its end.
+        """
+        light_nm = _within_formula(light_nm)
+        if light_nm == GREEN_NM:
+            return cls(1.0, 0.0, n_air)
+        # All water: its middle, and the corners of temperature and salinity.
+        t = np.array([0.5, 0.0, 0.0, 1.0, 1.0]) * _WARMEST_C
+        s = np.array([0.5, 0.0, 1.0, 0.0, 1.0]) * _SALTIEST
+        there, green = seawater_index(t, s, light_nm), seawater_index(t, s)
+        ratios = (there - 1.0) / (green - 1.0)
+        beside = seawater_index(t[0], s[0], GREEN_NM + GREEN_SIGMA_NM)
+        by_water = float(np.abs(ratios - ratios[0]).max())
+        by_light = float((beside - green[0]) / (green[0] - 1.0))
+        return cls(float(ratios[0]), float(np.hypot(by_water, by_light)), n_air)
+
+    def from_green(self, n_green: float) -> float:
+        """Return the index at the wavelength."""
+        return self.n_air + self.ratio * (n_green - self.n_air)
+
+    def to_green(self, n: float) -> float:
+        """Return the index for green light in water that has the index `n` at the wavelength."""
+        return self.n_air + (n - self.n_air) / self.ratio
+
+    def sigma(self, n_green: float, sigma_green: float) -> float:
+        """Return the standard deviation of `from_green`, where `n_green` has `sigma_green`."""
+        own = self.sigma_ratio * (n_green - self.n_air)
+        return float(np.hypot(self.ratio * sigma_green, own))
+
+
+def _within_formula(light_nm: float | None) -> float:
+    return GREEN_NM if light_nm is None else min(max(light_nm, 400.0), 700.0)
+
+
 def index_in_seawater(
     temperature_c: float, salinity_permille: float, light_nm: float | None, n_air: float
 ) -> float:
@@ -148,5 +199,5 @@ def index_in_seawater(
 
     Raises `OptionError` if temperature or salinity lies outside the formula's range.
     """
-    light_nm = GREEN_NM if light_nm is None else min(max(light_nm, 400.0), 700.0)
+    light_nm = _within_formula(light_nm)
     return float(seawater_index_vacuum(temperature_c, salinity_permille, light_nm, n_air=n_air))

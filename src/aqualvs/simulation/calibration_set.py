@@ -16,6 +16,7 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, common_wavelength
 from aqualvs.optics.rigfile import save_rig, shutter_mapping
 from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.optics.solved import with_exact_numbers
+from aqualvs.optics.water import Dispersion
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.dive import check_dive, simulate_dive, writable
@@ -188,9 +189,9 @@ def simulate_calibration(
     (`poses.csv` knows distances only, and half of the boards are not quite square), or
     `port_water/` one in water before a flat port, at unknown poses; `box/` is an open
     box of markers in air with all lasers on, the vehicle's pose unknown, and `index/clip_0/` a
-    plate that is fixed on the vehicle, in the rig's water. `dive/` is a wall to measure afterwards.
-    `truth/` holds what a user would not have: the rig, and the poses of boards (dome_from_board)
-    and vehicle (box_from_dome).
+    plate that is fixed on the vehicle, in the rig's water, seen in green light. `dive/` is a wall
+    to measure afterwards. `truth/` holds what a user would not have: the rig, and the poses of
+    boards (dome_from_board) and vehicle (box_from_dome).
 
     Parameters
     ----------
@@ -342,7 +343,10 @@ def _box(job: _Job) -> tuple[Path, Path]:
 
 
 def _index(job: _Job) -> tuple[Path, Path]:
-    rig, rng, folder = job.rig, job.rng(3), job.folder("index", "clip_0")
+    # A camera sees the plate in green light, whatever the colour of the lasers.
+    light = Dispersion.of(common_wavelength(job.rig.lasers), job.rig.n_air)
+    rig = job.rig.in_water(light.to_green(job.rig.n_water))
+    rng, folder = job.rng(3), job.folder("index", "clip_0")
     plate = targets.plate_before(rig, _PLATE_FAR)
     scenes = [targets.plate_scene(plate, i, _WATER) for i in range(job.size.index)]
     job.shoot(job.with_lasers(rig), scenes, folder, rng, "frame_{:03d}")

@@ -17,8 +17,9 @@ import numpy as np
 
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, common_wavelength
 from aqualvs.optics.solved import rig_uncertainty
+from aqualvs.optics.water import Dispersion
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water, in_water, prepared_rig
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Reason, Refusal
@@ -305,6 +306,8 @@ class WaterFollowingScanner(RecordableScanner):
             prior=prior,
             options=IndexOptions.of_target(place_mm, turn_deg),
         )
+        # The target is seen in green or white light.
+        self._light = Dispersion.of(common_wavelength(rig.lasers), rig.n_air)
         self._next_s = -np.inf
         self._n_read = 0
         self._last: IndexReading | None = None
@@ -319,7 +322,8 @@ class WaterFollowingScanner(RecordableScanner):
     @property
     def sigma_n_water(self) -> float:
         """Standard deviation of the index; NaN until the target has been seen."""
-        return float("nan") if self._last is None else self._last.sigma
+        last = self._last
+        return float("nan") if last is None else self._light.sigma(last.n, last.sigma)
 
     def lines(self) -> list[str]:
         """Return the lines of the run's summary about the water."""
@@ -330,7 +334,8 @@ class WaterFollowingScanner(RecordableScanner):
                 f"{self._rig.n_water:.4f}"
             ]
         found = [
-            f"water index {last.n:.5f} ± {last.sigma:.5f} from {count_text(self._n_read, 'frame')}"
+            f"water index {self._light.from_green(last.n):.5f} ± {self.sigma_n_water:.5f} from "
+            f"{count_text(self._n_read, 'frame')}"
         ]
         if not last.observable:
             found.append("the pictures alone do not determine the index; see aqualvs check")
@@ -358,5 +363,6 @@ class WaterFollowingScanner(RecordableScanner):
         worth = 2e-4
         min_sigma_to_follow = 4e-3
         trusted = reading.sigma < min_sigma_to_follow
-        if trusted and abs(reading.n - self.scanner.rig.n_water) > worth:
-            self.scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
+        n_water = self._light.from_green(reading.n)
+        if trusted and abs(n_water - self.scanner.rig.n_water) > worth:
+            self.scanner = Scanner(self._rig.in_water(max(n_water, 1.0)), self._options)

@@ -17,6 +17,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.simulation.scenarios import example_rig
+from target_cases import index_target
 from whole import WHOLE
 
 FPS = 25.0
@@ -41,14 +42,7 @@ CAMERA = RigUncertainty.independent(
 
 
 def plate() -> FloatArray:
-    """Six tags of 12 mm on a plate 25 cm ahead, turned by 6 degrees."""
-    corners = [
-        (0.015 * i + a - 0.02, 0.0, 0.015 * j + b - 0.015)
-        for i in range(3)
-        for j in range(2)
-        for a, b in ((0.0, 0.012), (0.012, 0.012), (0.012, 0.0), (0.0, 0.0))
-    ]
-    return SE3.from_rotvec((0.0, 0.0, -0.1), (-0.04, 0.25, -0.02)).apply(corners)
+    return index_target().points()
 
 
 @dataclass

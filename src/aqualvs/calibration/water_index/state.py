@@ -16,7 +16,13 @@ import numpy as np
 
 from aqualvs.errors import OptionError, check_not_negative
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.water import GREEN_NM, N_AIR, seawater_index_slopes, seawater_index_vacuum
+from aqualvs.optics.water import (
+    GREEN_NM,
+    GREEN_SIGMA_NM,
+    N_AIR,
+    seawater_index_slopes,
+    seawater_index_vacuum,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +63,7 @@ class IndexPrior:
     ) -> "IndexPrior":
         """Return the prior from temperature and salinity, by Quan & Fry (1995).
 
-        The target is seen in the colour of the lasers (the green channel).
+        The target is seen in green or white light.
 
         Parameters
         ----------
@@ -71,9 +77,8 @@ class IndexPrior:
         OptionError
             If a value lies outside the formula's range.
         """
-        # Standard deviations; 5 nm change the index by 2e-4. The last is of the fit of Quan & Fry
-        # (1995) to its data.
-        sigma_c, sigma_permille, sigma_nm, sigma_formula = 0.5, 0.5, 5.0, 1.5e-5
+        # Standard deviations. The last is of the fit of Quan & Fry (1995) to its data.
+        sigma_c, sigma_permille, sigma_formula = 0.5, 0.5, 1.5e-5
         step_nm = 1.0
         n = float(seawater_index_vacuum(temperature_c, salinity_permille))
         slopes = seawater_index_slopes(temperature_c, salinity_permille)
@@ -81,7 +86,7 @@ class IndexPrior:
         parts = (
             float(slopes.by_temperature) * sigma_c,
             float(slopes.by_salinity) * sigma_permille,
-            (float(beside) - n) / step_nm * sigma_nm,
+            (float(beside) - n) / step_nm * GREEN_SIGMA_NM,
             sigma_formula,
         )
         source = f"{temperature_c:g} °C, {salinity_permille:g} per mille"
