@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from aqualvs.check.finding import index_sigma
+from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.water_index.estimator import calibrate_water
+from aqualvs.calibration.water_index.state import IndexOptions
+from aqualvs.check.finding import index_sigma, index_sigma_of_step
 from aqualvs.check.rig import check_rig, field_of_view, run_check
 from aqualvs.errors import RigError
 from aqualvs.geometry import SE3, Plane, rotation_from_rotvec
@@ -22,9 +25,17 @@ from aqualvs.optics.expected_error import (
 )
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, RigUncertainty, Window
+from aqualvs.optics.rig import (
+    DOME_FROM_CAM_NOMINAL,
+    Laser,
+    Rig,
+    RigUncertainty,
+    Window,
+    rig_parameter_names,
+)
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.sheet import Sheet, sheets_of
+from aqualvs.optics.solved import with_uncertainty
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig
 from aqualvs.text import Finding, Severity
 
@@ -169,6 +180,30 @@ def test_index_sigma_is_that_of_a_monte_carlo() -> None:
         found.append(tried[np.argmin(cost)])
     # A standard deviation from 400 trials is known to 3.5 %; four times that.
     assert np.std(found) == pytest.approx(told, rel=0.14)
+
+
+def test_the_index_is_no_better_known_than_the_rig() -> None:
+    """As `calibrate water` states it, by the uncertainty of rig and target."""
+    rig = example_rig()
+    rig = replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, [0.0, 0.03, 0.0]))
+    options = IndexOptions.of_target(0.2, 0.1)
+    x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
+    corners = np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)
+    pixels, seen = rig.camera().project(corners)
+    noisy = pixels[seen] + np.random.default_rng(4).normal(0.0, SIGMA_PX, (seen.sum(), 2))
+    view = View("picture", np.flatnonzero(seen), corners[seen], noisy)
+    told = []
+    for lens_m, words in ((1e-5, "gives it to"), (2e-3, "gives it only to")):
+        sigmas = dict.fromkeys(rig_parameter_names(rig), 1e-6)
+        sigmas |= dict.fromkeys(("lens_x", "lens_y", "lens_z"), lens_m)
+        known = RigUncertainty.independent(sigmas)
+        told.append(index_sigma_of_step(rig, known, options))
+        found = calibrate_water(rig, [view], uncertainty=known, options=options)
+        # The noise of 120 coordinates is known to 7 %; twice that.
+        assert told[-1] == pytest.approx(found.sigma, rel=0.14)
+        text = sentences(check_rig(with_uncertainty(rig, known)), Severity.OK)
+        assert words in text
+    assert index_sigma(rig) < told[0] < told[1]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from rich.table import Table
 
+from aqualvs.calibration.water_index.filter import MIN_POINTS, FrameCorners, IndexModel, believe
+from aqualvs.calibration.water_index.state import IndexOptions, first_state
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.expected_error import (
     N_POINTS,
     SIGMA_PX,
@@ -154,18 +157,44 @@ def index_sigma(rig: Rig) -> float:
     """Return the sigma of the water's index from a known target, infinite if not observable.
 
     The target is a plate of 10 by 6 corners, 180 by 100 mm, at a known position 0.4 m ahead, with
-    each corner detected to `SIGMA_PX`: like an index target on the vehicle in one picture.
+    each corner detected to `SIGMA_PX`: like an index target on the vehicle in one picture. Rig and
+    position count as exact; `index_sigma_of_step` does not take them so.
     """
     if rig.housing is None:
         return np.inf
-    x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
-    corners = np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)
+    corners = _plate()
     index_step = 1e-4
     stepped, seen_stepped = rig.in_water(rig.n_water + index_step).camera().project(corners)
     here, seen = rig.camera().project(corners)
     slope = (stepped - here)[seen & seen_stepped] / index_step
     information = float(np.sum(slope**2)) / SIGMA_PX**2
     return 1.0 / np.sqrt(information) if information > 0.0 else np.inf
+
+
+def index_sigma_of_step(rig: Rig, uncertainty: RigUncertainty, options: IndexOptions) -> float:
+    """Return the sigma that `calibrate water` gives the index by one picture of such a target.
+
+    `uncertainty` is that of the rig, `options` have that of the target's position. Infinite if the
+    index is not observable.
+    """
+    if rig.housing is None:
+        return np.inf
+    points = _plate()
+    pixels, seen = rig.camera().project(points)
+    if np.count_nonzero(seen) < MIN_POINTS:
+        return np.inf
+    ids = tuple(np.flatnonzero(seen).tolist())
+    frame = FrameCorners(0.0, ids, points[seen], pixels[seen])
+    model = IndexModel(rig, uncertainty, options, frame.points.mean(axis=0))
+    camera = uncertainty.of(model.camera_names)
+    state = first_state(0.0, rig.n_water, options.pose_sigmas, camera)
+    state = state.with_corners(ids, options.sigma_corner_px)
+    return believe(model, state, frame, SIGMA_PX).state.sigma
+
+
+def _plate() -> FloatArray:
+    x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
+    return np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)
 
 
 def _cell(value: float) -> str:

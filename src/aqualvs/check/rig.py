@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from aqualvs.calibration.water_index.state import IndexOptions
 from aqualvs.check.finding import (
     check_errors,
     error_table,
@@ -21,6 +22,7 @@ from aqualvs.check.finding import (
     expected_errors,
     findings_table,
     index_sigma,
+    index_sigma_of_step,
     sensitivity_table,
     share_plane,
     shutter_finding,
@@ -363,23 +365,30 @@ def _check_water(rig: Rig) -> Finding:
 
 def _check_index(rig: Rig) -> Finding:
     """Return a finding on whether the water's index is observable."""
-    sigma = index_sigma(rig)
-    if rig.flat_port is not None:
-        return Finding.ok(
-            f"Through a flat port the index is observable: one picture of a known target gives it "
-            f"to {sigma:.1g}."
-        )
-    if sigma < 5e-4:
-        return Finding.ok(
-            f"The lens is far enough from the dome's centre to determine the water's index: one "
-            f"picture of a known target gives it to {sigma:.1g}."
-        )
-    if rig.dome is None:
+    if rig.housing is None:
         return Finding.ok("Without a dome the water's index does not enter.")
-    seen = "not at all" if sigma > 0.1 else f"only to {sigma:.1g}"
+    # Those of `aqualvs calibrate water`, if not given.
+    place_mm, turn_deg = 0.2, 0.1
+    options = IndexOptions.of_target(place_mm, turn_deg)
+    sigma = index_sigma_of_step(rig, completed_uncertainty(rig), options)
+    place = f"a target whose place is known to {place_mm:g} mm and {turn_deg:g} degrees"
+    # With rig and target exactly known.
+    by_noise, far_enough = index_sigma(rig), 5e-4
+    if rig.dome is None:
+        lead = "Through a flat port the index is observable"
+    elif by_noise < far_enough:
+        lead = "The lens is far enough from the dome's centre for the index to be observable"
+    else:
+        seen = "not at all" if sigma > 0.1 else f"only to {sigma:.2g}"
+        return Finding.ok(
+            f"The lens is near the dome's centre, where the water's index can be determined {seen} "
+            "and hardly affects the range; give temperature and salinity."
+        )
+    if sigma < options.largest_sigma:
+        return Finding.ok(f"{lead}: one picture of {place} gives it to {sigma:.2g}.")
     return Finding.ok(
-        f"The lens is near the dome's centre, where the water's index can be determined {seen} and "
-        "hardly affects the range; give temperature and salinity."
+        f"{lead}, but with this rig's uncertainty one picture of {place} gives it only to "
+        f"{sigma:.2g}; give temperature and salinity."
     )
 
 
