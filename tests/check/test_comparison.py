@@ -15,6 +15,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rigfile import save_rig
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import with_uncertainty
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 
@@ -175,6 +176,45 @@ def test_coefficients_that_are_left_out_are_zero(
     new = replace(old, lens=lens)
     assert words in " ".join(compared(new, old, tmp_path).split())
     assert words in " ".join(compared(old, new, tmp_path).split())
+
+
+ROLLING = Shutter(kind=ShutterKind.ROLLING, readout=0.02)
+
+
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [
+        (
+            replace(example_rig(), shutter=ROLLING),
+            "The shutter is rolling, readout 20 ms and was global.",
+        ),
+        (
+            replace(example_rig(), shutter=Shutter(exposure=0.004)),
+            "The shutter is global, exposure 4 ms and was global.",
+        ),
+        (
+            replace(example_rig(), working_range=(0.3, 0.9)),
+            "The working range is 300 to 900 mm and was {near:g} to {far:g} mm.",
+        ),
+        (
+            replace(
+                example_rig(),
+                lasers=(
+                    replace(example_rig().lasers[0], wavelength_nm=640.0),
+                    *example_rig().lasers[1:],
+                ),
+            ),
+            "The wavelength of laser 'lower' is 640 nm and was not stated.",
+        ),
+    ],
+    ids=["shutter", "exposure", "range", "wavelength"],
+)
+def test_what_has_no_sigma_is_compared_too(tmp_path: Path, new: Rig, words: str) -> None:
+    near, far = example_rig().working_range
+    page = compared(new, example_rig(), tmp_path)
+    assert words.format(near=near * 1e3, far=far * 1e3) in page
+    assert "othing has changed" not in page
+    assert "Not changed at all: the lens, the camera" in page
 
 
 def test_malformed_notes_name_the_file(tmp_path: Path) -> None:

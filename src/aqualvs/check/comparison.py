@@ -33,6 +33,7 @@ from aqualvs.optics.rig import (
 )
 from aqualvs.optics.rigfile import dated_copies, load_rig
 from aqualvs.optics.sheet import sheet_in
+from aqualvs.optics.shutter import Shutter
 from aqualvs.optics.solved import file_parameter_name, rig_numbers, rig_uncertainty, solved_steps
 from aqualvs.text import sentence
 
@@ -302,7 +303,8 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     console = console or Console()
     console.print(f"{new} against {old}", style="bold", markup=False, highlight=False)
     parts = compared_parts(new_rig, old_rig, difference)
-    console.print(verdict(parts), style="bold", markup=False, highlight=False)
+    differs = any(_mismatches(new_rig, old_rig)) or any(_settings(new_rig, old_rig))
+    console.print(verdict(parts, differs=differs), style="bold", markup=False, highlight=False)
     if not all(part.is_same for part in parts):
         for line in consequence(new_rig, old_rig):
             console.print(line, markup=False, highlight=False)
@@ -310,7 +312,8 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
     same = ", ".join(f"'{name}' as '{before}'" for name, before in old_names.items())
     notes = [f"Lasers with new names are matched by their planes: {same}."] if same else []
-    for line in (*notes, *_missing_sigmas(known), *_mismatches(new_rig, old_rig)):
+    notes += [*_missing_sigmas(known), *_mismatches(new_rig, old_rig), *_settings(new_rig, old_rig)]
+    for line in notes:
         console.print(line, markup=False, highlight=False)
     return 0
 
@@ -336,14 +339,17 @@ def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[Compar
     return parts
 
 
-def verdict(parts: list[ComparedPart]) -> str:
-    """Return what moved and what stayed, in one sentence."""
+def verdict(parts: list[ComparedPart], *, differs: bool = False) -> str:
+    """Return what moved and what stayed, in one sentence.
+
+    `differs`: whether the rigs differ in what has no part, such as the shutter.
+    """
     moved = [part.sentence for part in parts if part.moved]
     stayed = [part.sentence for part in parts if not part.moved and not part.is_same]
     same = [part.name for part in parts if part.is_same]
     clauses = moved + stayed
     if same:
-        none = "not changed at all" if clauses else "nothing has changed"
+        none = "not changed at all" if clauses or differs else "nothing has changed"
         clauses.append(f"{none}: {', '.join(same)}")
     if not moved and stayed:
         clauses.insert(0, "nothing has moved that matters")
@@ -499,6 +505,38 @@ def _mismatches(new: Rig, old: Rig) -> Iterator[str]:
         for laser in rig.lasers:
             if laser.name not in shared:
                 yield f"Laser '{laser.name}' is {what}."
+
+
+def _settings(new: Rig, old: Rig) -> Iterator[str]:
+    """Yield sentences on changes of what both rigs state without any uncertainty."""
+    lasers = [(f"wavelength of laser '{b.name}'", a, b) for a, b in _shared_lasers(new, old)]
+    for what, have, had in (
+        ("shutter", _shutter_text(new.shutter), _shutter_text(old.shutter)),
+        ("working range", *(_range_text(rig) for rig in (new, old))),
+        *((what, _light_text(a), _light_text(b)) for what, a, b in lasers),
+    ):
+        if have != had:
+            yield f"The {what} is {have} and was {had}."
+
+
+def _shutter_text(shutter: Shutter) -> str:
+    words = [shutter.kind.value]
+    if shutter.readout != 0.0:
+        words.append(f"readout {1e3 * shutter.readout:.10g} ms")
+    if shutter.exposure > 0.0:
+        words.append(f"exposure {1e3 * shutter.exposure:.10g} ms")
+    if shutter.is_interlaced:
+        words.append(f"{shutter.first_field} field first")
+    return ", ".join(words)
+
+
+def _range_text(rig: Rig) -> str:
+    near, far = rig.working_range
+    return f"{1e3 * near:.10g} to {1e3 * far:.10g} mm"
+
+
+def _light_text(laser: Laser) -> str:
+    return "not stated" if laser.wavelength_nm is None else f"{laser.wavelength_nm:.10g} nm"
 
 
 def _old_names(new: Rig, old: Rig) -> dict[str, str]:
