@@ -178,6 +178,23 @@ def test_coefficients_that_are_left_out_are_zero(
     assert words in " ".join(compared(old, new, tmp_path).split())
 
 
+@pytest.mark.parametrize(("aspect_px", "moved"), [(0.01, False), (1.0, True)])
+def test_thousandths_of_a_pixel_are_no_change_of_the_lens(
+    tmp_path: Path, aspect_px: float, moved: bool
+) -> None:
+    """Views that agree make a combination of numbers look better known than any detector is."""
+    sigmas = np.where([name in ("fx", "fy") for name in NAMES], 0.05, SIGMAS)
+    covariance = np.diag(sigmas**2)
+    fx, fy = NAMES.index("fx"), NAMES.index("fy")
+    # fx - fy is known to 5e-4 px in each rig, or so the covariance says.
+    covariance[fx, fy] = covariance[fy, fx] = (1.0 - 5e-5) * 0.05**2
+    old = with_uncertainty(example_rig(), RigUncertainty(NAMES, covariance))
+    step = np.array([0.01 + aspect_px, 0.01])
+    page = compared(rig_moved_by(old, ("fx", "fy"), step), old, tmp_path)
+    assert ("ntrinsics changed by" in page) == moved
+    assert ("ntrinsics stayed" in page) != moved
+
+
 ROLLING = Shutter(kind=ShutterKind.ROLLING, readout=0.02)
 
 

@@ -29,6 +29,7 @@ from aqualvs.optics.rig import (
     Rig,
     RigUncertainty,
     laser_parameter_names,
+    rig_moved_by,
     tangent_basis,
 )
 from aqualvs.optics.rigfile import dated_copies, load_rig
@@ -393,18 +394,53 @@ def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> ComparedP
     change += f" and {moved_px:.2g} px (rms) by distortion"
     matters = share > _FOCAL_SHARE or max(centre, moved_px) > _CENTRE_PX
     names = old.lens.parameter_names
-    return _part(difference, "the intrinsics", names, change, matters)
+    widened = _with_detector_bias(old, difference)
+    return _part(widened, "the intrinsics", names, change, matters)
+
+
+def _with_detector_bias(rig: Rig, difference: RigDifference) -> RigDifference:
+    """Return the difference with errors of corners that all views share in its covariance.
+
+    Views that agree do not show them, so the covariance of a calibration lacks them. Without them
+    fx / fy may count as known to a millionth, and a thousandth of a pixel as a change.
+    """
+    # Smooth over the picture, rms; rendered views leave 0.001 to 0.01.
+    shared_px = 0.005
+    names = rig.lens.parameter_names
+    pixels = _picture_grid(rig)
+    directions, seen = rig.lens.directions(pixels)
+    rows = [difference.names.index(name) for name in names]
+    covariance = difference.covariance.copy()
+    # Numbers of one calibration have no error in the difference.
+    scale = np.sqrt(np.diag(covariance)[rows])
+    known = scale > 0.0
+    slopes = []
+    for name, step in zip(np.array(names)[known].tolist(), scale[known].tolist(), strict=True):
+        moved = rig_moved_by(rig, (name,), np.array([step]))
+        shifted, valid = moved.lens.pixels(directions)
+        slopes.append(np.where(valid[:, None], shifted - pixels, 0.0)[seen].reshape(-1))
+    if not slopes or not seen.any():
+        return difference
+    information = np.array(slopes) @ np.array(slopes).T / np.count_nonzero(seen)
+    bias = shared_px**2 * np.linalg.pinv(information, hermitian=True)
+    at = np.array(rows)[known]
+    covariance[np.ix_(at, at)] += bias * np.outer(scale[known], scale[known])
+    return replace(difference, covariance=covariance)
 
 
 def _distortion_change_px(new: Rig, old: Rig) -> float:
     """Return the shift of the old pixels by the new distortion, rms over the picture."""
-    width, height = old.size_px
-    grid = np.meshgrid(np.linspace(0.0, width - 1.0, 17), np.linspace(0.0, height - 1.0, 17))
-    pixels = np.stack(grid, axis=-1).reshape(-1, 2)
+    pixels = _picture_grid(old)
     directions, seen = old.lens.directions(pixels)
     moved, valid = replace(old.lens, distortion=new.lens.distortion).pixels(directions)
     squared = np.sum((moved - pixels)[seen & valid] ** 2, axis=-1)
     return float(np.sqrt(squared.mean())) if squared.size else math.inf
+
+
+def _picture_grid(rig: Rig) -> FloatArray:
+    width, height = rig.size_px
+    grid = np.meshgrid(np.linspace(0.0, width - 1.0, 17), np.linspace(0.0, height - 1.0, 17))
+    return np.stack(grid, axis=-1).reshape(-1, 2)
 
 
 def _housing_parts(housing: Housing, difference: RigDifference) -> Iterator[ComparedPart]:
