@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
 from aqualvs.errors import AqualvsError, OptionError
@@ -34,12 +34,32 @@ class StrictPart(BaseModel):
 AnyPart = TypeVar("AnyPart", bound=StrictPart)
 
 
+def _kind_of(value: object) -> str:
+    if isinstance(value, Mapping | BaseModel):
+        return KEYS.tag
+    return LIST.tag if isinstance(value, list | tuple) else NUMBER.tag
+
+
+NUMBER, LIST, KEYS, WORD = Tag("<number>"), Tag("<list>"), Tag("<keys>"), Tag("<word>")
+"""Tags for the branches of a union, so that a fault is one of the branch that was meant.
+
+Places in messages leave them out, and no key is called so.
+"""
+BY_KIND = Discriminator(_kind_of)
+"""Tells by the kind of a value which of the branches `NUMBER`, `LIST` and `KEYS` is meant."""
+_BRANCHES = {branch.tag for branch in (NUMBER, LIST, KEYS, WORD)}
+
 _TYPES = {
     "float_type": "a plain number",
+    "float_parsing": "a plain number",
     "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
     "bool_type": "true or false",
+    "bool_parsing": "true or false",
     "string_type": "a word",
     "list_type": "a list",
+    "tuple_type": "a list",
     "model_type": "keys and values",
     "model_attributes_type": "keys and values",
     "dict_type": "keys and values",
@@ -70,7 +90,7 @@ class SchemaWords:
 
     def first_fault(self, error: ValidationError, model: type[BaseModel]) -> str:
         """Return one line on the fault to mend first; a misspelt key explains the missing one."""
-        faults = error.errors(include_url=False)
+        faults = [_without_branches(fault) for fault in error.errors(include_url=False)]
         unknown = [fault for fault in faults if fault["type"] in ("extra_forbidden", "invalid_key")]
         fault = (unknown or faults)[0]
         place, kind = _place(fault["loc"]) or "the file", fault["type"]
@@ -108,6 +128,10 @@ class SchemaWords:
         known = [self.examples[str(step)] for step in place if step in self.examples]
         example = known[-1] if known else self.first_line
         return f", for example '{example}'" if example else ""
+
+
+def _without_branches(fault: ErrorDetails) -> ErrorDetails:
+    return {**fault, "loc": tuple(step for step in fault["loc"] if step not in _BRANCHES)}
 
 
 def _closest(place: tuple[int | str, ...], model: type[BaseModel]) -> str:

@@ -122,6 +122,13 @@ def test_a_rig_that_exists_is_a_design_with_its_own_lasers():
             "a name of its own",
         ),
         ({"net": {"bar_mm": "15"}}, "net.bar_mm is '15'"),
+        (
+            {
+                "lasers": None,
+                "mounts": [{"name": "a", "position_mm": [0, 0, -150], "stripe_deg": "bets"}],
+            },
+            "mounts[0].stripe_deg is 'bets'; write a plain number, or 'best'",
+        ),
     ],
 )
 def test_faults_name_file_value_and_remedy(parts, words):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Discriminator, Field
 
 from aqualvs.design.settings import (
     Design,
@@ -29,6 +29,8 @@ from aqualvs.optics.rigschema import ShutterPart, Tilt, WaterPart, range_fault
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR
 from aqualvs.schema import (
+    NUMBER,
+    WORD,
     Index,
     NotNegative,
     Number,
@@ -73,6 +75,22 @@ _Triple = Annotated[list[_Place], Field(min_length=3, max_length=3)]
 _Pixels = Annotated[int, Field(gt=0, le=_MAX_PX)]
 _Fan = Annotated[float, Field(gt=0.0, lt=180.0, allow_inf_nan=False)]
 _Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
+
+
+def _stripe_kind(value: object) -> str | None:
+    if value == "best":
+        return WORD.tag
+    return None if isinstance(value, str) else NUMBER.tag
+
+
+_Stripe = Annotated[
+    Annotated[Number, NUMBER] | Annotated[Literal["best"], WORD],
+    Discriminator(
+        _stripe_kind,
+        custom_error_type="stripe",
+        custom_error_message="write a plain number, or 'best'",
+    ),
+]
 
 
 class CameraDesign(StrictPart):
@@ -125,7 +143,7 @@ class MountPart(StrictPart):
 
     name: str
     position_mm: _Triple
-    stripe_deg: Number | Literal["best"] | None = None
+    stripe_deg: _Stripe | None = None
     tilt_deg: _Tilt | None = None
     fan_deg: _Fan = FAN_DEG
 

@@ -18,7 +18,18 @@ from scipy.interpolate import PchipInterpolator
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
-from aqualvs.schema import NotNegative, Number, Positive, StrictPart, si_values, validated
+from aqualvs.schema import (
+    BY_KIND,
+    KEYS,
+    LIST,
+    NUMBER,
+    NotNegative,
+    Number,
+    Positive,
+    StrictPart,
+    si_values,
+    validated,
+)
 from aqualvs.simulation.scene import (
     Box,
     Bubble,
@@ -209,7 +220,9 @@ class CourseFile(_Part):
     period_s: Positive = 4.0
 
 
-Motion: TypeAlias = Number | list[Number] | CourseFile
+Motion: TypeAlias = Annotated[
+    Annotated[Number, NUMBER] | Annotated[list[Number], LIST] | Annotated[CourseFile, KEYS], BY_KIND
+]
 
 
 class MotionFile(_Part):
