@@ -117,6 +117,8 @@ class SchemaWords:
         ends = str(place[0]) if place else "", str(place[-1]) if place else ""
         if ends in self.remedies:
             return self.remedies[ends]
+        if kind == "too_short" and fault["ctx"]["min_length"] == 1:
+            return "write one value or more"
         if kind in _LIMITS:
             return _LIMITS[kind].format(**fault.get("ctx", {}))
         if kind in _TYPES:

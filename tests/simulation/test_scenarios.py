@@ -87,6 +87,8 @@ def test_file_is_read_in_its_units(tmp_path):
         ),
         ("motion: {range_mm: [500, abc]}", "motion.range_mm[1] is 'abc'; write a plain number"),
         ("motion: {range_mm: abc}", "motion.range_mm is 'abc'; write a plain number"),
+        ("motion: {range_mm: []}", "motion.range_mm is []; write one value or more"),
+        ("motion: {yaw_deg: {values: []}}", "motion.yaw_deg.values is []; write one value or more"),
         ("fish: 2.5", "fish is 2.5; write a whole number"),
         ("lasers_on: maybe", "lasers_on is 'maybe'; write true or false"),
         ("water: {veil: 3}", "water.veil is 3; write a list"),

@@ -203,6 +203,7 @@ class Scenario(SceneContent):
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Triple: TypeAlias = tuple[Number, Number, Number]
+_Values: TypeAlias = Annotated[list[Number], Field(min_length=1)]
 
 
 class _Part(StrictPart):
@@ -214,14 +215,14 @@ class _Part(StrictPart):
 class CourseFile(_Part):
     """Schema of one quantity over the dive; see `Course`."""
 
-    values: Annotated[list[Number], Field(min_length=1)]
+    values: _Values
     mode: Literal["smooth", "steps"] = "smooth"
     sway: NotNegative = 0.0
     period_s: Positive = 4.0
 
 
 Motion: TypeAlias = Annotated[
-    Annotated[Number, NUMBER] | Annotated[list[Number], LIST] | Annotated[CourseFile, KEYS], BY_KIND
+    Annotated[Number, NUMBER] | Annotated[_Values, LIST] | Annotated[CourseFile, KEYS], BY_KIND
 ]
 
 
