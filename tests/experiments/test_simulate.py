@@ -13,15 +13,19 @@ import numpy as np
 import pytest
 
 from aqualvs.cli.main import main
+from aqualvs.errors import OptionError
 from aqualvs.experiments import simulate as body
 from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.results.folder import RunOutputs
 from aqualvs.simulation.calibration_set import CalibrationFiles
 from aqualvs.simulation.dive import (
     LEAD_S,
     NET_BEARING,
     NET_DEPTH,
+    check_motion,
+    shutter_from_words,
     write_hole_truth,
     write_vehicle_log,
 )
@@ -137,6 +141,39 @@ def test_measured_water_goes_to_the_step_that_takes_it(
     assert ("water" in told) == ("run" not in steps)
     found = {step: [word for word in line if word in MEASURED] for step, line in told.items()}
     assert {step: words for step, words in found.items() if words} == steps
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("motion: {range_mm: -300}", "range is -300 mm; it must be positive"),
+        ("motion: {yaw_deg: [0, 95]}", "pitch 0 and yaw 8.* deg: the target would be seen edge on"),
+        # The log goes on before and after the dive.
+        ("motion: {range_mm: {values: [300], sway: 400}}", "range is -.* mm; it must be positive"),
+    ],
+)
+def test_a_motion_that_cannot_be_is_refused_before_anything_is_written(
+    text, said, tmp_path, capsys
+):
+    file, out = tmp_path / "dive.yaml", tmp_path / "dive"
+    file.write_text(f"duration_s: 0.4\nnet: {{}}\n{text}\n")
+    with pytest.raises(OptionError, match=rf"^scenario .*dive\.yaml: motion: {said}"):
+        body.simulate(str(file), None, out, print, camera="ideal", overwrite=False)
+    assert not out.exists()
+    assert "frames" not in capsys.readouterr().err
+
+
+def test_the_motion_is_checked_in_every_row_that_a_shutter_takes(tmp_path):
+    file = tmp_path / "dive.yaml"
+    # At the time of each frame the sway is at rest; its peaks are halfway between them.
+    file.write_text(
+        "duration_s: 0.4\nwalls: [{}]\n"
+        "motion: {range_mm: {values: [300], sway: 400, period_s: 0.08}}\n"
+    )
+    course = load_scenario(file)
+    check_motion(course, AT_ONCE, "here")
+    with pytest.raises(OptionError, match="here: range is -100 mm"):
+        check_motion(course, shutter_from_words("rolling:40", course.fps), "here")
 
 
 def test_the_holes_of_the_try_out_are_found_where_they_are(scenario, log_file, tmp_path):

@@ -25,6 +25,7 @@ from aqualvs.simulation.cameras import SimulatedCamera, simulated_camera
 from aqualvs.simulation.dive import (
     LEAD_S,
     check_dive,
+    check_motion,
     shutter_from_words,
     simulate_dive,
     write_hole_truth,
@@ -86,6 +87,7 @@ def simulate(
         place = f"scenario {scenario}: shutter"
         rig = replace(rig, shutter=shutter_from_words(course.shutter, course.fps, place))
     check_dive(rig, course.fps, model.recording, rig_file)
+    check_motion(course, rig.shutter, f"scenario {scenario}: motion")
     claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
     video, truth = out / "dive.mp4", out / "truth.csv"
     with claim, writing(out), StopSignals() as stop, progress(scenario, course.n_frames) as tick:

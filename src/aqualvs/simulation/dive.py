@@ -59,17 +59,21 @@ def write_vehicle_log(scenario: Scenario, path: Path) -> None:
     (`LEAD_S`). Raises `OSError` if it cannot be written.
     """
     rng = np.random.default_rng([scenario.seed, 23])
-    rate_hz = 10.0
     with path.open("w", newline="", encoding="ascii") as file:
         table = csv.writer(file)
         table.writerow(LOG_COLUMNS)
-        for log_s in np.arange(0.0, scenario.duration + 2.0 * LEAD_S, 1.0 / rate_hz):
+        for log_s in _log_times(scenario):
             pose = scenario.trajectory.pose_at(log_s - LEAD_S, scenario.duration)
             depth = NET_DEPTH - pose.inverse().translation[2] + _SIGMA_DEPTH * rng.normal()
             angles = np.array(vehicle_attitude(pose)) + _SIGMA_ANGLE * rng.normal(size=3)
             heading, roll, pitch = np.rad2deg(angles)
             cells = (heading % 360.0, roll, pitch)
             table.writerow([f"{log_s:.2f}", f"{depth:.3f}", *(f"{cell:.2f}" for cell in cells)])
+
+
+def _log_times(scenario: Scenario) -> FloatArray:
+    rate_hz = 10.0
+    return np.arange(0.0, scenario.duration + 2.0 * LEAD_S, 1.0 / rate_hz)
 
 
 def write_hole_truth(scenario: Scenario, path: Path) -> None:
@@ -250,6 +254,23 @@ def check_dive(rig: Rig, fps: float, recording: Compression, rig_file: Path | No
     check_shutter(rig.shutter, fps)
     place = f"{rig_file or f'rig {rig.name}'}: image"
     check_size(rig.size_px, recording, rig.shutter.field_of(0), place)
+
+
+def check_motion(scenario: Scenario, shutter: Shutter, place: str) -> None:
+    """Raise `OptionError`, which names `place`, if the motion comes to a posture that cannot be.
+
+    Asked are the times of the pictures that `shutter` takes and, of a net, of the vehicle's log.
+    """
+    middle = 0.5 * shutter.readout if shutter.is_interlaced else 0.0
+    reach = 0.5 * (abs(shutter.readout) + shutter.exposure)
+    # A set: most shutters take all at once.
+    offsets = {0.0, middle - reach, middle, middle + reach}
+    log = (_log_times(scenario) - LEAD_S).tolist() if scenario.nets else []
+    try:
+        for t in (*(t + offset for t in scenario.times() for offset in offsets), *log):
+            scenario.trajectory.pose_at(t, scenario.duration)
+    except OptionError as fault:
+        raise OptionError(f"{place}: {fault}") from None
 
 
 def _write_points(path: Path, lit: LitPoints) -> None:
