@@ -185,6 +185,16 @@ def validated(
         raise error(f"{source}: {told}") from None
 
 
+def twine_fault(twine_mm: float, bar_mm: float) -> str:
+    """Return what is wrong with the twine of a file's net, "" if nothing is."""
+    if twine_mm < bar_mm:
+        return ""
+    return (
+        f"net.twine_mm is {twine_mm:g}, not thinner than the bar of {bar_mm:g} mm; write the "
+        "diameter of one twine in millimetres"
+    )
+
+
 def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
     """Return the content of a file, checked key by key; `kind` is what it may hold.
 

@@ -70,6 +70,12 @@ def test_file_is_read_in_its_units(tmp_path):
         ("net: {bar: 25}", "net.bar is not a key of this file; did you mean 'bar_mm'?"),
         ("motion: {rolling: 3}", "allowed here: range_mm"),
         ("net: {bar_mm: -3}", "net.bar_mm is -3"),
+        (
+            "net: {twine_mm: 40}",
+            "net.twine_mm is 40, not thinner than the bar of 25 mm; write the diameter of one "
+            "twine in millimetres",
+        ),
+        ("net: {bar_mm: 2}", "net.twine_mm is 2, not thinner than the bar of 2 mm"),
         ("net: {mesh: round}", "net.mesh is 'round'"),
         ("duration_s: .nan", "duration_s is nan"),
         (

@@ -39,7 +39,7 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
 from aqualvs.scanning.target import TargetKind
-from aqualvs.schema import Positive, SchemaWords, StrictPart, validated
+from aqualvs.schema import Positive, SchemaWords, StrictPart, twine_fault, validated
 from aqualvs.yamlfile import read_yaml
 
 if TYPE_CHECKING:
@@ -195,11 +195,8 @@ def target_dict(text: str) -> TargetFacts:
     file = validated(_TargetFile, content, path, OptionError, _WORDS)
     said, lengths = None, {}
     if (net := file.net) is not None:
-        if net.twine_mm is not None and net.twine_mm >= net.bar_mm:
-            raise OptionError(
-                f"{path}: net.twine_mm is {net.twine_mm:g}, not thinner than the bar of "
-                f"{net.bar_mm:g} mm; write the diameter of one twine in millimetres"
-            )
+        if net.twine_mm is not None and (fault := twine_fault(net.twine_mm, net.bar_mm)):
+            raise OptionError(f"{path}: {fault}")
         twine = None if net.twine_mm is None else 1e-3 * net.twine_mm
         said = NetFacts(net.mesh, 1e-3 * net.bar_mm, twine)
         lengths = said.filter_lengths()

@@ -28,6 +28,7 @@ from aqualvs.schema import (
     Positive,
     StrictPart,
     si_values,
+    twine_fault,
     validated,
 )
 from aqualvs.simulation.scene import (
@@ -372,6 +373,8 @@ def parse_scenario(content: Any, name: str, source: str) -> Scenario:
     Raises `OptionError` if a key is unknown or a value makes no sense.
     """
     file = validated(ScenarioFile, content, f"scenario {source}", OptionError)
+    if file.net and (fault := twine_fault(file.net.twine_mm, file.net.bar_mm)):
+        raise OptionError(f"scenario {source}: {fault}")
     for i, fold in enumerate(file.net.folds if file.net else []):
         if _fold(fold).overlaps:
             raise OptionError(
