@@ -143,6 +143,15 @@ def test_measured_water_goes_to_the_step_that_takes_it(
     assert {step: words for step, words in found.items() if words} == steps
 
 
+def test_without_lasers_no_state_of_the_net_is_offered(tmp_path, capsys):
+    dark = tmp_path / "dark.yaml"
+    dark.write_text("duration_s: 0.04\nnet: {}\nlasers_on: false\n")
+    body.simulate(str(dark), None, tmp_path / "dive", print, camera="ideal", overwrite=False)
+    said = capsys.readouterr().out
+    assert "aqualvs run " in said
+    assert "aqualvs net " not in said
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

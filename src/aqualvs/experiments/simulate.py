@@ -106,6 +106,8 @@ def simulate(
     commands = [[str(word) for word in run]]
     if course.nets:
         echo(f"true holes: {out / _HOLES}")
+    # Without lasers there is nothing to say of a net.
+    if course.nets and course.lasers_on:
         log = ["--log", str(out / _LOG), "--log-offset-s", f"{LEAD_S:g}"]
         commands.append(["net", str(out / "run"), *log])
     _echo_commands(commands, echo)
