@@ -422,11 +422,11 @@ def test_a_run_compares_with_its_truth(request_for, dive, tmp_path):
     assert "Error against truth" in write_report(result.report.parent).read_text(encoding="utf-8")
 
 
-def test_a_truth_of_empty_water_compares_nothing(request_for, dive, tmp_path):
+def test_a_truth_without_a_posture_compares_nothing(request_for, dive, tmp_path):
     truth = write_csv(tmp_path / "truth.csv", "frame,range_mm,pitch_deg,yaw_deg", "0,,,", "1,,,")
     result = run(request_for(dive, truth=truth, report=True), scanner_for=LumaScanner())
     assert result.comparison.lines() == [
-        "against the truth: nothing was ahead in any of its frames"
+        "against the truth: it states no posture in any of its frames"
     ]
     assert result.report.is_file()
 

@@ -143,6 +143,25 @@ def test_measured_water_goes_to_the_step_that_takes_it(
     assert {step: words for step, words in found.items() if words} == steps
 
 
+@pytest.mark.parametrize(
+    ("text", "n_notes"),
+    [
+        ("walls: [{yaw_deg: 20, pitch_deg: -10}]", 1),
+        ("boxes: [{centre_mm: [0, 200, 0]}]", 1),
+        ("walls: [{yaw_deg: 20}, {}]", 0),
+        ("fish: 1", 0),
+    ],
+)
+def test_simulate_says_that_what_is_ahead_has_no_true_posture(
+    text, n_notes, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(body, "simulate_dive", lambda *_, **__: None)
+    file = tmp_path / "dive.yaml"
+    file.write_text(f"duration_s: 0.04\n{text}\n")
+    body.simulate(str(file), None, tmp_path / "dive", print, camera="ideal", overwrite=False)
+    assert capsys.readouterr().out.count("note: truth.csv states no posture") == n_notes
+
+
 def test_without_lasers_no_state_of_the_net_is_offered(tmp_path, capsys):
     dark = tmp_path / "dark.yaml"
     dark.write_text("duration_s: 0.04\nnet: {}\nlasers_on: false\n")

@@ -41,6 +41,10 @@ CALIBRATION = "calibration"
 """Argument, instead of a scenario, for pictures for a calibration."""
 
 _ABOUT_CALIBRATION = "no dive: pictures for all four steps of a calibration, with the truth"
+_NO_POSTURE = (
+    "truth.csv states no posture, for it has those of a net, or of a wall with behind_mm, yaw_deg "
+    "and pitch_deg of 0; move and tilt such a wall by motion"
+)
 _LOG, _HOLES = "vehicle.csv", "truth_holes.csv"
 _FILES = ("dive.mp4", "truth.csv", "rig.yaml", _LOG, _HOLES)
 
@@ -102,6 +106,8 @@ def simulate(
         except _StoppedError as early:
             stopped = early
     echo(f"{stopped or count_text(course.n_frames, 'frame')}: {video}, truth: {truth}")
+    if course.target == "none" and (course.walls or course.boxes):
+        echo(f"note: {_NO_POSTURE}")
     run = ["run", video, "--rig", out / "rig.yaml", "--truth", truth, "-o", out / "run"]
     commands = [[str(word) for word in run]]
     if course.nets:

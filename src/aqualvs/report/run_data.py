@@ -115,8 +115,8 @@ def _first_field(frame: FloatArray, field: "_Words") -> Field | None:
 def read_truth(path: Path, track: Track) -> FloatArray:
     """Read truth, as `aqualvs.results.summary.read_truth` does, onto the frames of a track.
 
-    Returns it as `Track.posture`, shape (N, 3); NaN where the file has no such frame, or nothing
-    was ahead. Raises `SourceError` if the file cannot be read, or has postures of other frames
+    Returns it as `Track.posture`, shape (N, 3); NaN where the file has no such frame, or no
+    posture of it. Raises `SourceError` if the file cannot be read, or has postures of other frames
     only.
     """
     rows = truth_by_frame(path)

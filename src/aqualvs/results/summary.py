@@ -56,7 +56,7 @@ class TruthComparison:
     def lines(self) -> list[str]:
         """Return the comparison as lines of text."""
         if not self.n_compared and not self.n_missed:
-            return ["against the truth: nothing was ahead in any of its frames"]
+            return ["against the truth: it states no posture in any of its frames"]
         if not self.n_compared:
             return [f"against the truth: no posture in its {count_text(self.n_missed, 'frame')}"]
         return [
