@@ -18,6 +18,7 @@ from aqualvs.cli import main as cli
 from aqualvs.cli.command import CheckedCommand
 from aqualvs.cli.main import main
 from aqualvs.errors import AqualvsError
+from report_cases import make_dive, write_truth
 from shell_cases import rig_file
 from waiting import until
 
@@ -333,3 +334,15 @@ def test_a_fault_with_a_huge_value_stays_short(tmp_path, refused):
     said = refused("check", path), refused("follow", "--sim", "--plan", tmp_path / "plan.yaml")
     assert max(map(len, said)) < 2500
     assert "plan.yaml: aqualvs_plan is 'yyy" in said[1]
+
+
+def test_a_report_prints_the_errors_that_its_page_shows(tmp_path, capsys):
+    dive = make_dive(tmp_path / "run", video=False)
+    assert main(["report", str(dive.folder), "--truth", str(write_truth(dive, bias_mm=2.0))]) == 0
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first == "against the truth in 31 frames (9 with truth but without posture):"
+    assert last == f"report: {dive.folder / 'report.html'}"
+    empty = tmp_path / "empty.csv"
+    empty.write_text("frame,range_mm,pitch_deg,yaw_deg\n0,,,\n")
+    assert main(["report", str(dive.folder), "--truth", str(empty)]) == 0
+    assert "it states no posture in any of its frames" in capsys.readouterr().out

@@ -208,13 +208,17 @@ def report(
 ) -> None:
     """Rewrite a report."""
     from aqualvs.report.run_page import write_report
-    from aqualvs.results.folder import REPORT_HTML, claim_run, recover
+    from aqualvs.results.folder import POSTURE_CSV, REPORT_HTML, claim_run, recover
+    from aqualvs.results.summary import compare_with_truth
 
     if recover(folder):
         typer.echo(f"{folder}: points completed from the journal of a run that was killed")
     # Rewriting the report is the purpose of the command.
     with claim_run(folder, [REPORT_HTML], overwrite=True):
-        typer.echo(f"report: {write_report(folder, truth=truth)}")
+        found = None if truth is None else compare_with_truth(folder / POSTURE_CSV, truth)
+        page = write_report(folder, truth=truth)
+    for line in [*(found.lines() if found else []), f"report: {page}"]:
+        typer.echo(line)
 
 
 def simulate(

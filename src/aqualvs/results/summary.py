@@ -7,6 +7,7 @@ import math
 import statistics
 from array import array
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -52,9 +53,13 @@ class TruthComparison:
     # In degrees.
     pitch_deg: Deviation
     yaw_deg: Deviation
+    doubt: str = ""  # Why the truth may be that of another dive.
 
     def lines(self) -> list[str]:
         """Return the comparison as lines of text."""
+        return [*self._lines(), *([f"warning: {self.doubt}"] if self.doubt else [])]
+
+    def _lines(self) -> list[str]:
         if not self.n_compared and not self.n_missed:
             return ["against the truth: it states no posture in any of its frames"]
         if not self.n_compared:
@@ -102,6 +107,7 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
         range_percent=_deviation(100 * error[:, 0] / true[:, 0]),
         pitch_deg=_deviation(error[:, 1]),
         yaw_deg=_deviation(error[:, 2]),
+        doubt=_other_times(truth_csv, _times_s(true_rows), posture_csv, _times_s(measured_rows)),
     )
 
 
@@ -123,6 +129,37 @@ def _truth(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, float]]
     if found:
         check_range_unit(path, rows[0], max(value for value, _, _ in found.values()))
     return found
+
+
+def _times_s(rows: Sequence[Row]) -> dict[int, float]:
+    """Return the times by frame, of rows that have both."""
+    pairs = ((_number(row["frame"]), _number(row.get("time_s"))) for row in rows)
+    return {int(frame): time_s for frame, time_s in pairs if math.isfinite(frame + time_s)}
+
+
+def _other_times(
+    truth_csv: Path, true_s: Mapping[int, float], posture_csv: Path, own_s: Mapping[int, float]
+) -> str:
+    """Return where frames of a truth are half a frame before or after a run's, "" if nowhere."""
+    common = sorted(true_s.keys() & own_s.keys())
+    if len(common) < 2:
+        return ""
+    frames = np.array(common)
+    true, own = (np.array([times[i] for i in common]) for times in (true_s, own_s))
+    # A clock that began elsewhere is no fault, nor is one that runs so much faster: a rate of
+    # 29.97 is often called 30.
+    same_rate = 0.005
+    true, own = true - true[0], own - own[0]
+    frame_s = float(np.median(np.diff(own) / np.diff(frames)))
+    off = np.flatnonzero(np.abs(true - own) > 0.5 * frame_s + same_rate * np.abs(own))
+    if not len(off):
+        return ""
+    i = off[0]
+    return (
+        f"{truth_csv}: frame {frames[i]} is {true[i]:.3f} s after frame {frames[0]}, but "
+        f"{own[i]:.3f} s in {posture_csv}; is it the truth of this dive, or does the run of "
+        "images lack --fps?"
+    )
 
 
 def check_range_unit(path: Path, first: Row, range_m: float) -> None:
