@@ -71,6 +71,23 @@ def test_options_take_the_place_of_the_files_values(tmp_path, capsys):
     assert "Laser 'lower' is in the picture at" in said
 
 
+@pytest.mark.parametrize("options", [["--lasers", "1"], ["--range-mm", "20:60", "--no-tilt"]])
+def test_a_design_without_a_posture_has_no_errors_to_compare(options, capsys):
+    assert main(["design", *options]) == 0
+    said = capsys.readouterr().out
+    assert "there is no posture." in said
+    assert "no posture" in said.split("Lasers:")[1]
+    for words in ("nan", "- and -", "Change of the errors", "Lens ahead", "A lens that sits"):
+        assert words not in said
+
+
+def test_a_range_without_a_posture_has_a_dash(capsys):
+    assert main(["design", "--lasers", "2", "--no-changes", "--no-tilt"]) == 0
+    said = capsys.readouterr().out
+    assert "nan" not in said
+    assert re.search(r"dome: - and [+-]\d.* turns yaw by - and [+-]\d\.\d\d degrees", said)
+
+
 def test_a_flat_port_takes_the_place_of_the_dome(tmp_path, capfd, refused):
     options = ["--flat-mm", "12:5", "--no-changes", "--no-tilt"]
     assert main(["design", *options, "-o", str(tmp_path)]) == 0

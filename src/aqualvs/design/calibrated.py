@@ -175,8 +175,9 @@ class OffsetCost:
 def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, ...]:
     """Return the errors by offsets of the lens, from zero to the largest possible in the dome.
 
-    Among them are the design's own offset and its centring tolerance. Empty without a dome.
-    `design` has the final tilts of its lasers; `ranges` are those of walls square ahead, in metres.
+    Among them are the design's own offset and its centring tolerance. Empty without a dome, or a
+    posture at any of the ranges. `design` has the final tilts of its lasers; `ranges` are those of
+    walls square ahead, in metres.
     """
     dome = design.rig.dome
     if dome is None:
@@ -188,7 +189,8 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
     # Largest offset of a lens, as a share of the inner radius.
     max_share = 0.9
     largest = max_share * dome.inner_radius
-    return tuple(_cost(rig, offset, ranges) for offset in sorted(offsets) if offset <= largest)
+    costs = tuple(_cost(rig, offset, ranges) for offset in sorted(offsets) if offset <= largest)
+    return costs if np.isfinite([one.neglected for one in costs]).any() else ()
 
 
 def _cost(rig: Rig, offset: float, ranges: Sequence[float]) -> OffsetCost:

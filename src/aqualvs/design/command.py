@@ -96,8 +96,9 @@ def run_design(request: DesignRequest) -> None:
         costs = offset_costs(best, best.rig.working_range)
         if costs:
             words = centring_text(best, costs, best.rig.working_range)
-            output(offset_table(costs, best.rig.working_range), words)
-        if request.try_changes:
+            output(offset_table(costs, best.rig.working_range), *filter(None, [words]))
+        # Shares of the errors that a design without a posture has are none.
+        if request.try_changes and predict_closely(best).valid.any():
             output(change_table(changes(best)))
         if request.out is not None:
             with writing(request.out):

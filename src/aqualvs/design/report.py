@@ -232,10 +232,16 @@ def offset_table(costs: Sequence[OffsetCost], ranges: Sequence[float]) -> Table:
 
 
 def centring_text(design: Design, costs: Sequence[OffsetCost], ranges: Sequence[float]) -> str:
-    """Return the errors by the design's centring tolerance without a calibration of the dome."""
+    """Return the errors by the design's centring tolerance without a calibration of the dome.
+
+    Empty if that lens gives no posture at any of the ranges.
+    """
     off = min(costs, key=lambda one: abs(one.offset - design.centring))
+    if not np.isfinite([off.neglected, off.calibrated, off.aside]).any():
+        return ""
     shares = _percents(off.neglected, ranges), _percents(off.calibrated, ranges)
-    yaw = " and ".join(f"{angle:+.2f}" for angle in np.degrees(off.aside[:, 2]))
+    angles = np.degrees(off.aside[:, 2]).tolist()
+    yaw = " and ".join("-" if math.isnan(angle) else f"{angle:+.2f}" for angle in angles)
     return (
         f"A lens that sits {off.offset * 1e3:g} mm off its place, if nobody calibrates the dome: "
         f"{shares[0]} of range, and {shares[1]} if the lasers are calibrated with the same "
