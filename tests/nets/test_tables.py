@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -212,6 +213,19 @@ def test_holes_are_drawn_to_scale(tmp_path):
         inside.append(max(round_ones))
     # The rim takes a share of the smaller one.
     assert 3.8 < inside[1] / inside[0] < 5.5
+
+
+def test_no_marker_of_the_map_points_to_one_side(folder):
+    """A vehicle may move left, and its start must not look like a direction."""
+    root = ElementTree.parse(folder / "net_map.svg").getroot()
+    # Matplotlib names markers by m and a number; ticks are open lines, dots have curves.
+    defined = root.iterfind(".//{*}defs/{*}path")
+    shapes = [one.get("d", "").strip() for one in defined if one.get("id", "").startswith("m")]
+    closed = [d for d in shapes if d.endswith("z") and "C" not in d]
+    assert closed
+    for d in closed:
+        corners = {(float(x), float(y)) for x, y in re.findall(r"[ML] (\S+) (\S+)", d)}
+        assert corners == {(-x, y) for x, y in corners}
 
 
 def test_equal_results_give_equal_maps(wall, folder, tmp_path):

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _COLOURS = "cividis"
 _GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
 _INK, _SEA = "#14222c", "#f4f7f8"
+# Marker of the track's start: a square, which has no direction and is no hole.
+_START = "s"
 # Its keys are a type of their own in some versions of Matplotlib.
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -155,7 +157,7 @@ def _draw(axes: "Axes", wall: UnrolledNet, shades: "ScalarMappable") -> None:
         axes.plot(*line.T, color=_INK, linewidth=2.0 * width, alpha=0.55, solid_capstyle="round")
         axes.plot(*line.T, color=_PATH, linewidth=width, marker="o", markersize=2.0 * width)
     start = wall.path[0][0]
-    axes.plot(*start, marker=">", color=_PATH, markeredgecolor=_INK, markersize=8)
+    axes.plot(*start, marker=_START, color=_PATH, markeredgecolor=_INK, markersize=8)
     for hole, middle in zip(wall.holes, wall.holes_xy, strict=True):
         width, height = _drawn_size(wall, hole.extent)
         axes.add_patch(
@@ -275,7 +277,7 @@ def _legend(figure: "Figure", wall: UnrolledNet) -> None:
     path = Line2D([], [], color=_INK, marker="o", markersize=3.5, markerfacecolor=_PATH)
     start, hole = (
         Line2D([], [], linestyle="", marker=mark, color=fill, markeredgecolor=edge, markersize=size)
-        for mark, fill, edge, size in ((">", _PATH, _INK, 8), ("o", "white", _HOLE, 9))
+        for mark, fill, edge, size in ((_START, _PATH, _INK, 8), ("o", "white", _HOLE, 9))
     )
     shown: dict[str, Line2D | Patch] = {"vehicle’s track": path, "its start": start}
     if wall.holes:
