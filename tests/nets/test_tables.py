@@ -228,6 +228,16 @@ def test_no_marker_of_the_map_points_to_one_side(folder):
         assert corners == {(-x, y) for x, y in corners}
 
 
+@pytest.mark.parametrize(("bars", "warned"), [(0.35, False), (0.45, True), (1.2, True)])
+def test_a_motion_near_half_a_mesh_a_frame_is_warned_of(bars, warned):
+    """Along a family's normal: a four-sided net shifted by a bar looks the same."""
+    one = stretch(0, (0.0, 0.0))
+    normal, pitch = one.lattice.normals[0], one.lattice.pitch[0]
+    way = bars * pitch * normal * (one.last_frame - one.first_frame)
+    said = "\n".join(net_lines(walled([stretch(0, way)]), 1.0, 62))
+    assert ("about half a mesh or more from frame to frame in 62 of 62 frames" in said) == warned
+
+
 def test_equal_results_give_equal_maps(wall, folder, tmp_path):
     names = ("net_map.png", "net_map.svg")
     draw_map(wall, [tmp_path / name for name in names])
@@ -274,7 +284,8 @@ def test_report_shows_the_net_of_its_folder(wall, tmp_path):
 
 
 def test_a_track_that_slipped_is_told(tmp_path):
-    climbing = [stretch(i, (STEP * (i + 1), 0.3 * (i + 1))) for i in range(N)]
+    places = [(STEP * i, 0.3 * i) for i in range(N + 1)]
+    climbing = [stretch(i, places[i + 1], begin=places[i]) for i in range(N)]
     wall = walled(climbing, vehicle=log())
     said = net_lines(wall, 1.0, 200)[-1]
     assert said.startswith("warning: the track and the log's depth differ by 1.8 m")

@@ -366,6 +366,7 @@ def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -
         "fouling": _mean(stretches, fouling_of, 4),
         "track_slip_m": round(wall.places.slip, 2),
         "track_breaks": stretches[-1].piece if stretches else 0,
+        "fast_frames": sum(one.n_frames for one in stretches if _is_fast(one)),
         "largest_hole_mm": None if largest is None else round(1e3 * float(largest), 1),
     }
 
@@ -381,9 +382,9 @@ def net_lines(wall: UnrolledNet, area: float, n_frames: int) -> list[str]:
 
 def track_warnings(summary: Mapping[str, Any]) -> list[str]:
     """Return why places and holes are not to be trusted, by a summary as of `net_dict`."""
-    slip, breaks, n_frames = (
+    slip, breaks, n_fast, n_frames = (
         found if isinstance(found := summary.get(name), int | float) else 0
-        for name in ("track_slip_m", "track_breaks", "n_net_frames")
+        for name in ("track_slip_m", "track_breaks", "fast_frames", "n_net_frames")
     )
     words = []
     if slip > 0.0:
@@ -398,7 +399,25 @@ def track_warnings(summary: Mapping[str, Any]) -> list[str]:
             f"{count_text(int(n_frames), 'frame')}: a hole may count once for each piece, and "
             "places are unreliable; frames are too far apart, or images lack their rate (--fps)"
         )
+    # A part of the dive that is worth another one.
+    good_part = 0.2
+    if n_fast > good_part * n_frames:
+        words.append(
+            f"the net moves by about half a mesh or more from frame to frame in {int(n_fast)} of "
+            f"{count_text(int(n_frames), 'frame')}: meshes may be miscounted, so that places are "
+            "unreliable; move slower, or record more frames per second"
+        )
     return words
+
+
+def _is_fast(stretch: NetStretch) -> bool:
+    """Return whether the net moves nearly half a mesh a frame: by more, meshes are miscounted."""
+    n_steps = stretch.last_frame - stretch.first_frame
+    if stretch.lattice is None or n_steps == 0:
+        return False
+    near_half = 0.4
+    meshes = stretch.lattice.basis @ (stretch.place - stretch.begin_place) / n_steps
+    return bool(np.abs(meshes).max() > near_half)
 
 
 def place_text(place: NetPlace) -> str:
