@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
 
-from aqualvs.calibration.water_index.state import IndexPrior
 from aqualvs.errors import OptionError, RigError
 from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rig import Rig
@@ -210,29 +209,17 @@ def calibration_commands(
     poses = ["--medium=water"] if files.poses is None else [f"--poses={files.poses}"]
     dome = [str(files.dome), f"--board={files.rail_board}", *poses, *update]
     lasers = [str(files.box), f"--box={files.box_file}", f"--lasers={len(rig.lasers)}", *update]
-    steps = {"camera": camera, "dome": dome, "lasers": lasers}
     measured = []
     if seawater is not None:
         measured = [f"--temperature-c={seawater[0]:g}", f"--salinity={seawater[1]:g}"]
-    is_green = seawater is None or _is_of_green_light(rig, seawater)
-    if is_green:
-        steps["water"] = [str(files.index), f"--target={files.target}", *measured, *update]
+    water = [str(files.index), f"--target={files.target}", *measured, *update]
+    steps = {"camera": camera, "dome": dome, "lasers": lasers, "water": water}
     commands = [["calibrate", step, *arguments] for step, arguments in steps.items()]
     commands.append(["check", file, "--against", str(files.rig)])
     if files.dive is not None:
         dive = [str(files.dive), "--rig", file, "--truth", str(files.dive_truth)]
-        water = [] if is_green else measured
-        commands.append(["run", *dive, *water, "-o", str(out / "run")])
+        commands.append(["run", *dive, "-o", str(out / "run")])
     return commands
-
-
-def _is_of_green_light(rig: Rig, seawater: tuple[float, float]) -> bool:
-    """Return whether the index of a rig's water is that of green light.
-
-    `calibrate water` expects that index; for lasers of another colour, `run` computes theirs.
-    """
-    green = IndexPrior.seawater(*seawater, n_air=rig.n_air)
-    return abs(rig.n_water - green.n) < 3.0 * green.sigma
 
 
 def print_scenarios(echo: Echo) -> None:
