@@ -11,7 +11,7 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
 from aqualvs.optics.shutter import Field
-from aqualvs.scanning.assignment import AssignmentTest, inflate_for_rival
+from aqualvs.scanning.assignment import AssignmentTest, inflate_for_bend, inflate_for_rival
 from aqualvs.scanning.candidates import Candidates, LinkedCandidates, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector, FramePeaks
 from aqualvs.scanning.labels import label_candidates
@@ -290,7 +290,7 @@ class Scanner:
             found = self._fit_posture(linked, target)
         else:
             found = self._fit_posture(linked.where(free), target).among(free)
-        found = inflate_for_rival(found, choice.tested)
+        found = inflate_for_bend(inflate_for_rival(found, choice.tested), linked, target)
         # The mean plane of folds covers all of a net's light, nearer parts included.
         nearer = None if found.folded else targets.contradiction(linked, choice.surfaces, target)
         if nearer is None or not found.posture:
