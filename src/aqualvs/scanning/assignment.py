@@ -397,7 +397,7 @@ class AssignmentTest:
         or more in a row. Read as the next lasers', the stripes of the others are those of a surface
         so far away that one more stripe lies where it is not searched for.
         """
-        if not self.is_faint(target, subsegments):
+        if not self._rows or not self.is_faint(target, subsegments):
             return None
         laser = subsegments.laser[target.members]
         found = (self._beyond(target.plane, row, laser, lacks_last=True) for row in self._rows)
