@@ -210,6 +210,7 @@ class Recorder:
 
     def _run(self) -> None:
         """Write chunks until the recorder is closed; the body of the thread."""
+        unwritten = ""
         while (messages := self._next_chunk()) is not None:
             written = self._write(messages.seal())
             with self._changed:
@@ -217,6 +218,9 @@ class Recorder:
                 self._waiting_bytes -= messages.n_bytes
                 if not written:
                     self._n_dropped += n_samples
+                    unwritten = self._fault
+        # A last small chunk may have found room.
+        self._fault = self._fault or unwritten
         try:
             self._file.close()
         except OSError as fault:
