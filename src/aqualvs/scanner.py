@@ -11,14 +11,19 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
 from aqualvs.optics.shutter import Field
-from aqualvs.scanning.assignment import AssignmentTest, inflate_for_bend, inflate_for_rival
+from aqualvs.scanning.assignment import AssignmentTest, inflate_for_rival
 from aqualvs.scanning.candidates import Candidates, LinkedCandidates, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector, FramePeaks
 from aqualvs.scanning.labels import label_candidates
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands, search_range
 from aqualvs.scanning.patch import fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.posture_estimator import FitMethod, Measurement, PostureEstimator
+from aqualvs.scanning.posture_estimator import (
+    FitMethod,
+    Measurement,
+    PostureEstimator,
+    inflate_for_bend,
+)
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.surfaces import Surface, SurfaceFinder, not_on_others

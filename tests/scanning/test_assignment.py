@@ -225,39 +225,6 @@ def test_a_near_rival_widens_and_a_far_one_does_not() -> None:
     assert inflate_for_rival(found, NOT_TESTED) is found
 
 
-def hull(radius: float, distance: float) -> list[tuple[Plane, Lit]]:
-    """A level cylinder in 30 facets of 3 degrees, each lit where it touches the cylinder."""
-    axis, step = np.array([0.0, distance + radius, 0.0]), np.deg2rad(3.0)
-    facets: list[tuple[Plane, Lit]] = []
-    for angle in step * np.arange(-15, 16):
-        normal = np.array([0.0, np.cos(angle), -np.sin(angle)])
-
-        def lit(points: FloatArray, angle: float = angle) -> BoolArray:
-            _, away, up = (points - axis).T
-            near: BoolArray = abs(np.arctan2(up, -away) - angle) < 0.5 * step
-            return near
-
-        facets.append((Plane.from_normal(normal, float(normal @ axis) - radius), lit))
-    return facets
-
-
-def test_the_sigma_of_a_bent_body_covers_its_bend() -> None:
-    """Two upright stripes over a hull lie on some plane that touches it above or below."""
-    fan = Fan(n_lines=2, spacing_deg=12.0, baseline=(-0.12, 0.0, 0.0), aim_deg=10.0, roll_deg=0.0)
-    scanner = Scanner(fan_rig(fan, (0.25, 1.3)))
-    wall = Plane.from_normal((0.0, 1.0, -0.06), 0.6)
-    for body, least_deg, most_deg in (
-        (hull(0.3, 0.6), 3.0, 12.0),
-        ([(wall, everywhere)], 0.0, 0.1),
-    ):
-        found = scanner.measure(0, 0.0, peaks_of(scanner.rig, body, 0.1)).posture
-        assert isinstance(found, Posture)
-        sigma_deg = np.degrees(np.sqrt(found.covariance[1, 1]))
-        assert least_deg <= sigma_deg <= most_deg
-        if least_deg:
-            assert abs(np.degrees(found.pitch)) < 3.0 * sigma_deg
-
-
 def small(points: FloatArray) -> BoolArray:
     """Light on a flank of 8 cm, where two of the example rig's stripes cross at 0.95 m."""
     lit: BoolArray = np.hypot(points[:, 0] - 0.085, points[:, 2] + 0.172) < 0.04

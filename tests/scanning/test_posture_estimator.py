@@ -1,4 +1,4 @@
-"""Crossing zones: as far around another laser's sheet as its stripe is wide, bent or not."""
+"""Crossing zones, as wide as the other laser's stripe; and the sigma of bent bodies."""
 
 from collections.abc import Callable
 
@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.observations import StripeObserver, in_crossing
+from aqualvs.scanning.posture import Posture
 from aqualvs.simulation.scenarios import example_rig
+from fan_cases import Fan, fan_rig
+from scanning_cases import Lit, everywhere, peaks_of
 from windowed_cases import windowed
 
 ANYWHERE = np.zeros(3)
@@ -60,3 +65,36 @@ def test_where_two_stripes_merge_the_place_on_the_target_counts() -> None:
     assert len(crossing) > 5
     assert crossed(0.95 * crossing, m).all()
     assert not crossed(0.95 * crossing, ANYWHERE).all()
+
+
+def hull(radius: float, distance: float) -> list[tuple[Plane, Lit]]:
+    """A level cylinder in 30 facets of 3 degrees, each lit where it touches the cylinder."""
+    axis, step = np.array([0.0, distance + radius, 0.0]), np.deg2rad(3.0)
+    facets: list[tuple[Plane, Lit]] = []
+    for angle in step * np.arange(-15, 16):
+        normal = np.array([0.0, np.cos(angle), -np.sin(angle)])
+
+        def lit(points: FloatArray, angle: float = angle) -> BoolArray:
+            _, away, up = (points - axis).T
+            near: BoolArray = abs(np.arctan2(up, -away) - angle) < 0.5 * step
+            return near
+
+        facets.append((Plane.from_normal(normal, float(normal @ axis) - radius), lit))
+    return facets
+
+
+def test_the_sigma_of_a_bent_body_covers_its_bend() -> None:
+    """Two upright stripes over a hull lie on some plane that touches it above or below."""
+    fan = Fan(n_lines=2, spacing_deg=12.0, baseline=(-0.12, 0.0, 0.0), aim_deg=10.0, roll_deg=0.0)
+    scanner = Scanner(fan_rig(fan, (0.25, 1.3)))
+    wall = Plane.from_normal((0.0, 1.0, -0.06), 0.6)
+    for body, least_deg, most_deg in (
+        (hull(0.3, 0.6), 3.0, 12.0),
+        ([(wall, everywhere)], 0.0, 0.1),
+    ):
+        found = scanner.measure(0, 0.0, peaks_of(scanner.rig, body, 0.1)).posture
+        assert isinstance(found, Posture)
+        sigma_deg = np.degrees(np.sqrt(found.covariance[1, 1]))
+        assert least_deg <= sigma_deg <= most_deg
+        if least_deg:
+            assert abs(np.degrees(found.pitch)) < 3.0 * sigma_deg

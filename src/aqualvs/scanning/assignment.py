@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import lazy_kernel, python_of
+from aqualvs.geometry.compiled import lazy_kernel
 from aqualvs.geometry.linear_algebra import n_bins
 from aqualvs.geometry.planes import Plane, exchanged_plane, shifted_plane
 from aqualvs.scanning.assignment_kernels import (
@@ -52,11 +52,11 @@ from aqualvs.scanning.candidates import (
     number_cells,
 )
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, sample_bands
-from aqualvs.scanning.net_surfaces import has_strands_before, inflate_covariance, seen_through
+from aqualvs.scanning.net_surfaces import has_strands_before, inflate_for_plane, seen_through
 from aqualvs.scanning.plane_search import MIN_FACING, WEIGHT, X, Z
-from aqualvs.scanning.posture import Refusal, range_pitch_yaw
+from aqualvs.scanning.posture import Refusal
 from aqualvs.scanning.posture_estimator import Measurement
-from aqualvs.scanning.segments import ComponentShapes, is_bent, is_straight
+from aqualvs.scanning.segments import ComponentShapes, is_straight
 from aqualvs.scanning.surfaces import Surface
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -127,9 +127,6 @@ class _AssignmentOptions(NamedTuple):
     # 34 to 60 degrees. No light returns from beyond this many times the range.
     steep_of_two: float = 0.87
     max_lit: float = 3.0
-    # Height of the bend of a line, as a shift of the stripe, beyond which its body is no plane: the
-    # gate of planes is about as wide.
-    min_sagitta_px: float = 2.0
 
 
 _ODDS = _AssignmentOptions()
@@ -584,43 +581,8 @@ def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measure
     posture, other = found.posture, outcome.other
     if outcome.verdict is not Verdict.NEAR or other is None or isinstance(posture, Refusal):
         return found
-    distance, pitch, yaw = range_pitch_yaw(other.normal / other.offset)
-    rival = replace(posture, range=distance, pitch=pitch, yaw=yaw)
     share = 1.0 / (1.0 + math.exp(outcome.log_odds))
-    return replace(found, posture=inflate_covariance(posture, rival, share))
-
-
-def inflate_for_bend(found: Measurement, linked: LinkedCandidates, target: Surface) -> Measurement:
-    """Return a measurement with its covariance inflated by the bend of a solid target.
-
-    A plane through a hull or a pipe lies on a part of it that chance selects. Lines that go on
-    beside the plane in a smooth bend show the rest: the plane through all of them is as good.
-
-    Parameters
-    ----------
-    found : Measurement
-        Of the target.
-    linked : LinkedCandidates
-        Of the frame.
-    target : Surface
-        Of `linked`.
-    """
-    posture, (candidates, subsegments, shapes) = found.posture, linked
-    is_bent_any = bool((shapes.sagitta_px > _ODDS.min_sagitta_px).any())
-    if target.is_mesh or isinstance(posture, Refusal) or not is_bent_any:
-        return found
-    on_target = target.members[subsegments.of_candidate]
-    lines = np.unique(candidates.component[on_target])
-    lines = lines[shapes.sagitta_px[lines] > _ODDS.min_sagitta_px]
-    bent = [line for line in lines.tolist() if python_of(is_bent)(shapes, line)]
-    if not bent:
-        return found
-    points = candidates.points[on_target | np.isin(candidates.component, bent)]
-    centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
-    distance, pitch, yaw = range_pitch_yaw(normal / (normal @ centre))
-    whole = replace(posture, range=distance, pitch=pitch, yaw=yaw)
-    return replace(found, posture=inflate_covariance(posture, whole, 1.0))
+    return replace(found, posture=inflate_for_plane(posture, other, share))
 
 
 def _verdict(planes: FloatArray, measures: FloatArray) -> AssignmentOutcome:

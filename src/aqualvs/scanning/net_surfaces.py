@@ -27,7 +27,7 @@ from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.patch import height_over
 from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
-from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.posture import Posture, range_pitch_yaw
 
 # Transitions between two surfaces along the stripes, as a share of their expected number in random
 # order: with fewer than the first, the surfaces are side by side; with more than the second, one is
@@ -312,6 +312,17 @@ def inflate_covariance(posture: Posture, other: Posture, share: float) -> Postur
     difference = _difference(posture, other)
     return replace(
         posture, covariance=posture.covariance + share * np.outer(difference, difference)
+    )
+
+
+def inflate_for_plane(posture: Posture, plane: Plane, share: float) -> Posture:
+    """Return a posture with its covariance inflated by its difference from a plane's posture.
+
+    `share`: as in `inflate_covariance`.
+    """
+    distance, pitch, yaw = range_pitch_yaw(plane.normal / plane.offset)
+    return inflate_covariance(
+        posture, replace(posture, range=distance, pitch=pitch, yaw=yaw), share
     )
 
 

@@ -15,16 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import lazy_borrowing_kernel
+from aqualvs.geometry.compiled import lazy_borrowing_kernel, python_of
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.candidates import Candidates, Subsegments
+from aqualvs.scanning.candidates import Candidates, LinkedCandidates, Subsegments
 from aqualvs.scanning.laser_bands import LaserBand
 from aqualvs.scanning.net_surfaces import (
     disagreement,
     distances_off,
     fit_mean_plane,
     inflate_covariance,
+    inflate_for_plane,
     mark_beside,
     share_near,
 )
@@ -59,6 +60,7 @@ from aqualvs.scanning.plane_fit import (
 )
 from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, posture_of, validate
 from aqualvs.scanning.region_growing import MODERATELY_BESIDE, grow_region, has_much_beside
+from aqualvs.scanning.segments import CURVED_PX, is_bent
 from aqualvs.scanning.surfaces import Surface
 
 
@@ -562,6 +564,34 @@ def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
         return 1.0
     strands = seen.observations
     return share_near(strands.points, strands.laser, patch, _NEAR_SHARE * plane.offset)
+
+
+def inflate_for_bend(found: Measurement, linked: LinkedCandidates, target: Surface) -> Measurement:
+    """Return a measurement with its covariance inflated by the bend of a solid target.
+
+    A plane through a hull or a pipe lies on a part of it that chance selects. Lines that go on
+    beside the plane in a smooth bend show the rest: the plane through all of them is as good.
+
+    Parameters
+    ----------
+    found : Measurement
+        Of the target.
+    linked : LinkedCandidates
+        Of the frame.
+    target : Surface
+        Of `linked`.
+    """
+    posture, (candidates, subsegments, shapes) = found.posture, linked
+    curved = np.flatnonzero(shapes.sagitta_px > CURVED_PX)
+    if target.is_mesh or isinstance(posture, Refusal) or not len(curved):
+        return found
+    on_target = target.members[subsegments.of_candidate]
+    touching = np.intersect1d(curved, candidates.component[on_target])
+    bent = [s for s in touching.tolist() if python_of(is_bent)(shapes, s)]
+    if not bent:
+        return found
+    whole = Plane.fitted(candidates.points[on_target | np.isin(candidates.component, bent)])
+    return replace(found, posture=inflate_for_plane(posture, whole, 1.0))
 
 
 def _do_two_disagree(laser: IntArray, weights: FloatArray) -> bool:

@@ -29,6 +29,8 @@ from aqualvs.scanning.stripe import StripePeaks
 
 # Least sagitta of a bend, in pixels; errors of the lens are smaller.
 _MIN_SAGITTA_PX = 1.0
+CURVED_PX = 2.0
+"""Sagitta, in pixels, that lies beyond the gate for planes."""
 # Least number of search lines of a component with a distinctive shape; the light on a strand is
 # shorter.
 _MIN_LINES = 16
@@ -75,9 +77,7 @@ def is_bent(shapes: ComponentShapes, s: int) -> bool:
 @inline_borrowing_kernel
 def is_curved(shapes: ComponentShapes, s: int) -> bool:
     """Return whether component s is not straight for any reason, so not on a plane."""
-    # A bend of this height lies beyond the gate for planes.
-    curved_px = 2.0
-    return bool(shapes.n_lines[s] >= _MIN_LINES and shapes.sagitta_px[s] > curved_px)
+    return bool(shapes.n_lines[s] >= _MIN_LINES and shapes.sagitta_px[s] > CURVED_PX)
 
 
 @inline_borrowing_kernel
