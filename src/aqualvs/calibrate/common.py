@@ -64,18 +64,6 @@ N_LASERS = "n_lasers"
 WAVELENGTH_NM = "wavelength_nm"
 """Key of `Rig.solved_from`: wavelength of these lasers, in nanometres."""
 
-
-def lasers_wavelength(rig: Rig) -> float | None:
-    """Return the common wavelength (nm) of a rig's lasers, or, before it has any, the planned one.
-
-    None if they differ or it is unknown.
-    """
-    planned = rig.solved_from.get(WAVELENGTH_NM)
-    if not rig.lasers and isinstance(planned, int | float):
-        return float(planned)
-    return common_wavelength(rig.lasers)
-
-
 _Count = Annotated[int, Field(gt=0)]
 
 
@@ -165,6 +153,17 @@ def load_nominal(path: Path) -> Nominal:
         working_range=rig.working_range,
         shutter=rig.shutter,
     )
+
+
+def lasers_wavelength(rig: Rig) -> float | None:
+    """Return the common wavelength (nm) of a rig's lasers, or, before it has any, the planned one.
+
+    None if they differ or it is unknown.
+    """
+    planned = rig.solved_from.get(WAVELENGTH_NM)
+    if not rig.lasers and isinstance(planned, int | float):
+        return float(planned)
+    return common_wavelength(rig.lasers)
 
 
 def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:

@@ -84,8 +84,8 @@ class Console(Output):
         self._on_screen = self._stream.isatty()
         # A log begins with what goes wrong: of a run that ends at once, nothing else is told.
         self._next_s = -math.inf if self._on_screen else time.monotonic() + _LOG_EVERY_S
-        self._states: dict[str, State] = {}
-        self._causes: dict[str, str] = {}  # Of faults.
+        # The state of each part, and the cause of a fault: its words without their numbers.
+        self._told: dict[str, tuple[State, str]] = {}
 
     def send(self, sample: LiveSample) -> None:
         """Tell of parts that have changed at once, and of the posture when it is time."""
@@ -109,14 +109,10 @@ class Console(Output):
     def _report_changes(self, sample: LiveSample) -> None:
         health = sample.health
         for part in (health.source, *health.lasers, *health.outputs):
-            before = self._states.get(part.name, State.OFF)
-            self._states[part.name] = part.state
-            # The cause of a fault may change, not only the numbers in its words.
+            before = self._told.get(part.name, (State.OFF, ""))
             cause = _NUMBER.sub("", part.detail) if part.state is State.FAULT else ""
-            is_other = cause != self._causes.get(part.name, "")
-            self._causes[part.name] = cause
-            is_bad = bool({part.state, before} & {State.WARN, State.FAULT})
-            if is_bad and (part.state is not before or is_other):
+            self._told[part.name] = now = (part.state, cause)
+            if now != before and {part.state, before[0]} & {State.WARN, State.FAULT}:
                 detail = part.detail and f": {part.detail}"
                 self._write(f"{part.name}: {part.state.value}{detail}", stays=True)
 

@@ -367,10 +367,8 @@ class LiveFrames:
             if step == 1 and passed > 0:
                 self._spacings.append(passed)
             return index
-        if not self._spacings:
-            return index
         # A sender that was off has lost nothing meanwhile.
-        if self._clock.is_anew:
+        if not self._spacings or self._clock.is_anew:
             return index
         missing = max(0, round(passed / statistics.median(self._spacings)) - step)
         self._frame_counter.skip(missing)

@@ -298,13 +298,9 @@ class WaterFollowingScanner(RecordableScanner):
         prior = None
         if water.seawater is not None:
             prior = IndexPrior.seawater(*water.seawater, n_air=rig.n_air)
-        # Accuracy of a user's measurement of the plate's place; only the index is tracked.
-        place_mm, turn_deg = 0.2, 0.1
+        # Only the index is tracked.
         self._estimator = IndexEstimator(
-            rig,
-            uncertainty=rig_uncertainty(rig),
-            prior=prior,
-            options=IndexOptions.of_target(place_mm, turn_deg),
+            rig, uncertainty=rig_uncertainty(rig), prior=prior, options=IndexOptions.of_target()
         )
         # The target is seen in green or white light.
         self._light = Dispersion.of(common_wavelength(rig.lasers), rig.n_air)

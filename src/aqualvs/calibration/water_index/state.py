@@ -279,10 +279,11 @@ class IndexOptions:
         check_not_negative("water index", self, *self.__slots__)
 
     @classmethod
-    def of_target(cls, place_sigma_mm: float, turn_sigma_deg: float) -> Self:
+    def of_target(cls, place_sigma_mm: float = 0.2, turn_sigma_deg: float = 0.1) -> Self:
         """Return the options for a target with given uncertainties of its place on the vehicle.
 
-        An index counts as observable if it separates fresh water from sea water.
+        The defaults are the accuracy of a user's measurement, as in `aqualvs calibrate water`. An
+        index counts as observable if it separates fresh water from sea water.
         """
         # Fresh water and sea water differ by 0.008: an index known to half of that still separates
         # them.
