@@ -23,13 +23,13 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import POSE_PARAMETERS, Housing
 from aqualvs.optics.expected_error import WallView
+from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import (
     LASER_PARAMETERS,
     Laser,
     Rig,
     RigUncertainty,
     laser_parameter_names,
-    rig_moved_by,
     tangent_basis,
 )
 from aqualvs.optics.rigfile import dated_copies, load_rig
@@ -304,8 +304,8 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     console = console or Console()
     console.print(f"{new} against {old}", style="bold", markup=False, highlight=False)
     parts = compared_parts(new_rig, old_rig, difference)
-    differs = any(_mismatches(new_rig, old_rig)) or any(_settings(new_rig, old_rig))
-    console.print(verdict(parts, differs=differs), style="bold", markup=False, highlight=False)
+    others = [*_mismatches(new_rig, old_rig), *_settings(new_rig, old_rig)]
+    console.print(verdict(parts, differs=bool(others)), style="bold", markup=False, highlight=False)
     if not all(part.is_same for part in parts):
         for line in consequence(new_rig, old_rig):
             console.print(line, markup=False, highlight=False)
@@ -313,8 +313,7 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
     same = ", ".join(f"'{name}' as '{before}'" for name, before in old_names.items())
     notes = [f"Lasers with new names are matched by their planes: {same}."] if same else []
-    notes += [*_missing_sigmas(known), *_mismatches(new_rig, old_rig), *_settings(new_rig, old_rig)]
-    for line in notes:
+    for line in (*notes, *_missing_sigmas(known), *others):
         console.print(line, markup=False, highlight=False)
     return 0
 
@@ -394,11 +393,13 @@ def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> ComparedP
     change += f" and {moved_px:.2g} px (rms) by distortion"
     matters = share > _FOCAL_SHARE or max(centre, moved_px) > _CENTRE_PX
     names = old.lens.parameter_names
-    widened = _with_detector_bias(old, difference)
+    widened = _with_detector_bias(old.lens, old.size_px, difference)
     return _part(widened, "the intrinsics", names, change, matters)
 
 
-def _with_detector_bias(rig: Rig, difference: RigDifference) -> RigDifference:
+def _with_detector_bias(
+    lens: Lens, size_px: tuple[int, int], difference: RigDifference
+) -> RigDifference:
     """Return the difference with errors of corners that all views share in its covariance.
 
     Views that agree do not show them, so the covariance of a calibration lacks them. Without them
@@ -406,9 +407,9 @@ def _with_detector_bias(rig: Rig, difference: RigDifference) -> RigDifference:
     """
     # Smooth over the picture, rms; rendered views leave 0.001 to 0.01.
     shared_px = 0.005
-    names = rig.lens.parameter_names
-    pixels = _picture_grid(rig)
-    directions, seen = rig.lens.directions(pixels)
+    names = lens.parameter_names
+    pixels = _picture_grid(size_px)
+    directions, seen = lens.directions(pixels)
     rows = [difference.names.index(name) for name in names]
     covariance = difference.covariance.copy()
     # Numbers of one calibration have no error in the difference.
@@ -416,8 +417,7 @@ def _with_detector_bias(rig: Rig, difference: RigDifference) -> RigDifference:
     known = scale > 0.0
     slopes = []
     for name, step in zip(np.array(names)[known].tolist(), scale[known].tolist(), strict=True):
-        moved = rig_moved_by(rig, (name,), np.array([step]))
-        shifted, valid = moved.lens.pixels(directions)
+        shifted, valid = lens.moved_by({name: step}).pixels(directions)
         slopes.append(np.where(valid[:, None], shifted - pixels, 0.0)[seen].reshape(-1))
     if not slopes or not seen.any():
         return difference
@@ -430,15 +430,15 @@ def _with_detector_bias(rig: Rig, difference: RigDifference) -> RigDifference:
 
 def _distortion_change_px(new: Rig, old: Rig) -> float:
     """Return the shift of the old pixels by the new distortion, rms over the picture."""
-    pixels = _picture_grid(old)
+    pixels = _picture_grid(old.size_px)
     directions, seen = old.lens.directions(pixels)
     moved, valid = replace(old.lens, distortion=new.lens.distortion).pixels(directions)
     squared = np.sum((moved - pixels)[seen & valid] ** 2, axis=-1)
     return float(np.sqrt(squared.mean())) if squared.size else math.inf
 
 
-def _picture_grid(rig: Rig) -> FloatArray:
-    width, height = rig.size_px
+def _picture_grid(size_px: tuple[int, int]) -> FloatArray:
+    width, height = size_px
     grid = np.meshgrid(np.linspace(0.0, width - 1.0, 17), np.linspace(0.0, height - 1.0, 17))
     return np.stack(grid, axis=-1).reshape(-1, 2)
 

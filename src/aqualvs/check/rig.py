@@ -30,7 +30,7 @@ from aqualvs.check.finding import (
 from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Plane, Rays, exchanged_plane
 from aqualvs.optics.camera import POSE_PARAMETERS, Camera
-from aqualvs.optics.expected_error import StripeView, visible_stripe
+from aqualvs.optics.expected_error import ExpectedError, StripeView, visible_stripe
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty, laser_parameter_names
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.sheet import sheet_in
@@ -239,11 +239,10 @@ def run_check(path: Path, console: Console | None = None) -> int:
     rig = load_rig(path, need_lasers=False)
     console = console or Console()
     try:
-        findings = check_rig(rig)
+        findings, errors = _checked(rig)
     except RigError as error:
         raise RigError(f"{path}: {error}") from None
     console.print(f"{path}: rig '{rig.name}'", style="bold", markup=False, highlight=False)
-    errors = expected_errors(rig, completed_uncertainty(rig))
     bad = any(finding.severity is Severity.BAD for finding in findings)
     for line in (_verdict(findings), *error_text(errors)):
         console.print(line, style="bold red" if bad else "bold", highlight=False, soft_wrap=True)
@@ -262,20 +261,29 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
     `now` is the time, with a time zone, that the age of calibrations refers to; by default the
     computer's clock. Raises `RigError` if the notes of calibrations in the rig are malformed.
     """
+    return _checked(rig, now)[0]
+
+
+def _checked(
+    rig: Rig, now: datetime | None = None
+) -> tuple[list[Finding], tuple[ExpectedError, ...]]:
+    """Return the findings of `check_rig`, and the expected errors that they rest on."""
     camera, uncertainty = rig.camera(), rig_uncertainty(rig)
-    shutter = shutter_finding(rig)
-    return [
+    completed, shutter = completed_uncertainty(rig), shutter_finding(rig)
+    errors = expected_errors(rig, completed)
+    findings = [
         *_check_lens(rig),
         *_check_view(rig, camera),
         _check_water(rig),
-        _check_index(rig),
+        _check_index(rig, completed),
         *_check_lasers(rig, camera),
         *_check_pairs(rig.lasers),
         *_check_exchange(rig),
         *([] if shutter is None else [shutter]),
         *check_solved(rig, solved_steps(rig), uncertainty, now or datetime.now(UTC)),
-        *check_errors(expected_errors(rig, completed_uncertainty(rig))),
+        *check_errors(errors),
     ]
+    return findings, errors
 
 
 def _check_lens(rig: Rig) -> Iterator[Finding]:
@@ -363,14 +371,13 @@ def _check_water(rig: Rig) -> Finding:
     )
 
 
-def _check_index(rig: Rig) -> Finding:
+def _check_index(rig: Rig, uncertainty: RigUncertainty) -> Finding:
     """Return a finding on whether the water's index is observable."""
     if rig.housing is None:
         return Finding.ok("Without a dome the water's index does not enter.")
-    # Those of `aqualvs calibrate water`, if not given.
-    place_mm, turn_deg = 0.2, 0.1
-    options = IndexOptions.of_target(place_mm, turn_deg)
-    sigma = index_sigma_of_step(rig, completed_uncertainty(rig), options)
+    options = IndexOptions.of_target()
+    sigma = index_sigma_of_step(rig, uncertainty, options)
+    place_mm, turn_deg = 1e3 * options.sigma_place, math.degrees(options.sigma_turn)
     place = f"a target whose place is known to {place_mm:g} mm and {turn_deg:g} degrees"
     # With rig and target exactly known.
     by_noise, far_enough = index_sigma(rig), 5e-4
