@@ -174,11 +174,9 @@ def index_sigma(rig: Rig) -> float:
 def index_sigma_of_step(rig: Rig, uncertainty: RigUncertainty, options: IndexOptions) -> float:
     """Return the sigma that `calibrate water` gives the index by one picture of such a target.
 
-    `uncertainty` is that of the rig, `options` have that of the target's position. Infinite if the
-    index is not observable.
+    `rig` has a housing, `uncertainty` is its, and `options` have that of the target's position.
+    Infinite if the camera sees too little of the target.
     """
-    if rig.housing is None:
-        return np.inf
     points = _plate()
     pixels, seen = rig.camera().project(points)
     if np.count_nonzero(seen) < MIN_POINTS:
