@@ -288,6 +288,15 @@ def test_a_net_before_a_wall_under_many_lasers(fan: Fan, wall: Plane) -> None:
     assert_posture(found.posture, net, share=0.004, deg=1.0)
 
 
+@pytest.mark.parametrize(("share", "apart_px"), [(0.06, -33), (0.1, -25), (0.06, 18)])
+def test_a_double_reflection_is_no_net_before_a_wall(share: float, apart_px: int) -> None:
+    rig, wall = with_fan(bluerov2_rig(), FANS[0]), plane(0.63, 5.0, -8.0)
+    light = light_on(rig, [(wall, everywhere)], range(FANS[0].n_lines))
+    # Noise breaks the fainter stripes as twine does.
+    frame = frame_of(light + share * np.roll(light, apart_px, axis=1), noise=4.0)
+    assert_posture(Scanner(rig).process(frame).posture, wall)
+
+
 @pytest.mark.parametrize(
     ("rig", "distance"),
     [(example_rig(), 0.5), (windowed(example_rig()), 0.5), (windowed(example_rig()), 0.9)],

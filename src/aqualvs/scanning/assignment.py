@@ -270,7 +270,7 @@ class AssignmentTest:
                 continue
             is_mesh = one.is_mesh and not broken
             is_mesh = is_mesh or seen_through(one.members, target.members, subsegments)
-            if is_mesh or not broken:
+            if (is_mesh or not broken) and not is_reflection(linked, one, target):
                 return replace(one, is_mesh=is_mesh)
         return None
 
@@ -566,6 +566,57 @@ def other_lines_share(
         if is_other and is_straight(shapes, candidates.component[i]):
             others += candidates.confidence[i]
     return others / max(of_surface, 1e-12)
+
+
+def is_reflection(linked: LinkedCandidates, one: Surface, other: Surface) -> bool:
+    """Return whether a surface may be a double reflection of another one, which is brighter.
+
+    Panes and domes reflect a little light twice, which shows every stripe once more beside itself.
+    Anything in front of a surface hides from a laser what is behind it: a net with many lit search
+    lines leaves many dark ones there, a double reflection leaves none.
+
+    Parameters
+    ----------
+    linked : LinkedCandidates
+        Of a frame.
+    one, other : Surface
+        Found in it.
+    """
+    # Least share of the search lines on which the other surface is lit as well, and brighter: on
+    # walls behind 450 nets, of three lasers and of fans, it is 0.91 at most. Then the least number
+    # of search lines, as a share of the other surface's: fewer leave too few in a shadow.
+    min_lit_again, min_lines = 0.95, 0.2
+    if one.n_lines < min_lines * other.n_lines:
+        return False
+    candidates, subsegments, _ = linked
+    share = _brighter_share(candidates, subsegments.of_candidate, one.members, other.members)
+    return bool(share >= min_lit_again)
+
+
+@lazy_kernel
+def _brighter_share(
+    candidates: Candidates, of_candidate: IntArray, members: BoolArray, others: BoolArray
+) -> float:
+    """Return the share of a surface's search lines on which another surface is brighter.
+
+    `members` and `others`, shape (C,), are the subsegments on the two. Peaks on both do not count.
+    """
+    source, laser, line = candidates.source, candidates.laser, candidates.line
+    own = np.zeros(n_bins(source), np.bool_)
+    for i in range(source.shape[0]):
+        own[source[i]] |= members[of_candidate[i]]
+    height = np.zeros((2, n_bins(laser), n_bins(line)))
+    for i in range(source.shape[0]):
+        c = of_candidate[i]
+        if members[c] or (others[c] and not own[source[i]]):
+            k = 0 if members[c] else 1
+            height[k, laser[i], line[i]] = max(height[k, laser[i], line[i]], candidates.height[i])
+    lit, brighter = 0, 0
+    for k in range(height.shape[1]):
+        for j in range(height.shape[2]):
+            lit += height[0, k, j] > 0.0
+            brighter += height[1, k, j] > height[0, k, j] > 0.0
+    return brighter / max(lit, 1)
 
 
 def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measurement:

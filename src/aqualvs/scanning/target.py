@@ -9,8 +9,14 @@ import numpy as np
 
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, AssignmentTest, Verdict
-from aqualvs.scanning.candidates import Candidates, LinkedCandidates, Subsegments
+from aqualvs.scanning.assignment import (
+    NOT_TESTED,
+    AssignmentOutcome,
+    AssignmentTest,
+    Verdict,
+    is_reflection,
+)
+from aqualvs.scanning.candidates import Candidates, LinkedCandidates
 from aqualvs.scanning.net_surfaces import MIN_LINES_PER_LASER
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, Measurement
@@ -266,7 +272,7 @@ class TargetSelector:
         return choice._replace(surfaces=_with_replaced(choice.surfaces, other), target=other)
 
     def _choose_once(self, linked: LinkedCandidates, surfaces: list[Surface]) -> TargetChoice:
-        surfaces, target = self._best_target(linked.subsegments, surfaces)
+        surfaces, target = self._best_target(linked, surfaces)
         nearer = None
         if target is not None and self._kind is TargetKind.AUTO:
             nearer = self._assignment.overlooked(linked, surfaces, target)
@@ -289,10 +295,10 @@ class TargetSelector:
         """
         subsegments = linked.subsegments
         before = self._finder.find_before(linked, surfaces, target)
-        if before is None or not before.is_mesh:
+        if before is None or not before.is_mesh or is_reflection(linked, before, target):
             return surfaces, target
         if target.is_mesh:
-            return self._best_target(subsegments, [*surfaces, before])
+            return self._best_target(linked, [*surfaces, before])
         # Its light may have been read as the next lasers'.
         verdict, other, _ = self._assignment.test(linked, before)
         plane = before.plane if other is None or verdict is not Verdict.RIVAL else other
@@ -302,15 +308,19 @@ class TargetSelector:
         return [*surfaces, before], before
 
     def _best_target(
-        self, subsegments: Subsegments, surfaces: list[Surface]
+        self, linked: LinkedCandidates, surfaces: list[Surface]
     ) -> tuple[list[Surface], Surface | None]:
-        """Return the target and the surfaces, without those that other lasers' stripes explain."""
-        assignment = self._assignment
+        """Return the target and the surfaces, without those that other light explains.
+
+        It is that of other lasers' stripes, or of double reflections.
+        """
+        assignment, subsegments = self._assignment, linked.subsegments
         target = choose_target(surfaces, self._kind, self._working_range)
         while target is not None and len(surfaces) > 1:
             if not (
                 assignment.may_be_exchanged(subsegments, target)
                 or (assignment.fans and assignment.may_be_shifted(subsegments, surfaces, target))
+                or any(is_reflection(linked, target, one) for one in surfaces if one is not target)
             ):
                 break
             surfaces = [one for one in surfaces if one is not target]
