@@ -122,6 +122,7 @@ def test_a_rig_that_exists_is_a_design_with_its_own_lasers():
             "a name of its own",
         ),
         ({"net": {"bar_mm": "15"}}, "net.bar_mm is '15'"),
+        ({"net": {"bar_mm": 2}}, "net.twine_mm is 2.5, not thinner than the bar of 2 mm"),
         (
             {
                 "lasers": None,

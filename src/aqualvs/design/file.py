@@ -38,6 +38,7 @@ from aqualvs.schema import (
     StrictPart,
     parse_settings,
     si_values,
+    twine_fault,
 )
 from aqualvs.yamlfile import read_yaml
 
@@ -267,7 +268,7 @@ def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
 def _design(file: DesignFile, folder: Path) -> Design:
     """Return the design of a checked file; `folder` is that of rig files it names."""
     near, far = (value / _MM for value in file.working_range_mm)
-    fault = range_fault(*file.working_range_mm)
+    fault = range_fault(*file.working_range_mm) or twine_fault(file.net.twine_mm, file.net.bar_mm)
     if fault:
         raise OptionError(fault)
     lens, size_px, shutter = _camera(file.camera, folder)
