@@ -1,8 +1,11 @@
 """The main path on painted frames: postures, every reason to refuse, labels."""
 
+import copy
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
+from pickle import dumps, loads
 from typing import Any, TypeAlias
 
 import cv2
@@ -473,6 +476,33 @@ def test_frames_do_not_depend_on_each_other() -> None:
         if one.posture and other.posture:
             assert one.posture.range == other.posture.range
             np.testing.assert_array_equal(one.posture.covariance, other.posture.covariance)
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda one: loads(dumps(one))])
+def test_a_copy_measures_what_its_original_does(copied: Callable[[Scanner], Scanner]) -> None:
+    rig = example_rig()
+    frame = frame_of(light_on(rig, [(plane(0.5, 4.0), everywhere)], ALL), noise=3.0)
+    options = ScannerOptions(target=TargetKind.SOLID)
+    scanner = Scanner(rig, options, rig.in_water(1.36).camera())
+    found = scanner.process(frame)
+    other = copied(scanner)
+    assert found.posture
+    np.testing.assert_array_equal(
+        other.process(frame).points.points_in_dome, found.points.points_in_dome
+    )
+    assert other.options == options
+
+
+def test_threads_share_a_scanner() -> None:
+    rig = example_rig()
+    walls = [plane(0.45 + 0.05 * i, 4.0) for i in range(6)]
+    frames = [frame_of(light_on(rig, [(wall, everywhere)], ALL), noise=3.0) for wall in walls]
+    scanner = Scanner(rig)
+    alone = [scanner.process(frame).points.points_in_dome for frame in frames]
+    with ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(scanner.process, 4 * frames))
+    for points, scan in zip(4 * alone, together, strict=True):
+        np.testing.assert_array_equal(points, scan.points.points_in_dome)
 
 
 def test_a_frame_is_left_as_it_was() -> None:

@@ -1,7 +1,8 @@
 """The main path: a frame in, posture and points out."""
 
+import threading
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -90,6 +91,9 @@ class Scanner:
     Frames of an interlaced camera are fields (`Shutter.field_of`); their points are in pixels of
     the whole picture, whose camera model holds.
 
+    `process` may be called from any thread, but measures one frame at a time; threads that are to
+    measure at once need a scanner each. Copies and pickles are made anew of the same arguments.
+
     Parameters
     ----------
     rig : Rig
@@ -105,6 +109,9 @@ class Scanner:
     ) -> None:
         self.rig = rig
         self.options = options or ScannerOptions()
+        self._camera = camera
+        # Frames share the buffers of the detectors.
+        self._lock = threading.Lock()
         # The rig's own record of its uncertainty; no frame needs it.
         from aqualvs.optics.solved import completed_uncertainty
 
@@ -132,6 +139,10 @@ class Scanner:
             self._row_motion = RowMotion(rig)
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
 
+    def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
+        # Some buffers are views of others; copies of both would part.
+        return type(self), (self.rig, self.options, self._camera)
+
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
 
@@ -155,7 +166,8 @@ class Scanner:
                 f"expected a Frame but got {type(frame).__name__}; make one of an image by "
                 "aqualvs.Frame(index, time_s, *aqualvs.planes_of_image(image))"
             )
-        return self.scan(frame)[1]
+        with self._lock:
+            return self.scan(frame)[1]
 
     def scan(self, frame: Frame) -> tuple[FramePeaks, Scan]:
         """Return the peaks of a frame as well as what `process` does. Raises as `detect`."""
