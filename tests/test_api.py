@@ -123,3 +123,33 @@ def test_a_picture_that_opencv_could_not_read_is_named() -> None:
     board = Path(__file__).parent / "data" / "real-wall" / "board.yaml"
     with pytest.raises(aqualvs.AqualvsError, match="picture 1: None; cv2"):
         aqualvs.calibrate_camera([np.zeros((576, 720), np.uint8), None], board)
+
+
+CHROMA = (np.full((288, 360), 100, np.uint8), np.full((288, 360), 90, np.uint8))
+
+
+@pytest.mark.parametrize(
+    "chroma",
+    [
+        np.stack(CHROMA),
+        CHROMA[0],
+        (None, None),
+        (CHROMA[0],),
+        (CHROMA[0][::2, ::2], CHROMA[1][::2, ::2]),
+        (CHROMA[0].repeat(2, 0), CHROMA[1].repeat(2, 0)),
+        (CHROMA[0][..., None], CHROMA[1][..., None]),
+        (CHROMA[0].astype(np.float32), CHROMA[1]),
+    ],
+)
+def test_chroma_that_does_not_fit_is_refused(chroma) -> None:
+    scanner = aqualvs.Scanner(aqualvs.load_rig(files("aqualvs") / "data" / "demo" / "rig.yaml"))
+    luma = np.zeros((576, 720), np.uint8)
+    with pytest.raises(aqualvs.AqualvsError, match=r"frame 3 has chroma .* shape \(288, 360\)"):
+        scanner.process(aqualvs.Frame(3, 0.0, luma, chroma))
+
+
+@pytest.mark.parametrize("luma", [None, [[0]]])
+def test_luma_that_is_no_array_is_refused(luma) -> None:
+    scanner = aqualvs.Scanner(aqualvs.load_rig(files("aqualvs") / "data" / "demo" / "rig.yaml"))
+    with pytest.raises(aqualvs.AqualvsError, match=r"^frame 0 holds .*planes_of_image"):
+        scanner.process(aqualvs.Frame(0, 0.0, luma))

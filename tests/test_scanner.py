@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.optics.rig import Rig
@@ -503,6 +504,11 @@ def test_threads_share_a_scanner() -> None:
         together = list(pool.map(scanner.process, 4 * frames))
     for points, scan in zip(4 * alone, together, strict=True):
         np.testing.assert_array_equal(points, scan.points.points_in_dome)
+
+
+def test_what_is_no_rig_is_refused() -> None:
+    with pytest.raises(RigError, match=r"rig is 'rig.yaml'; give what aqualvs.load_rig makes"):
+        Scanner("rig.yaml")  # type: ignore[arg-type]
 
 
 def test_a_frame_is_left_as_it_was() -> None:

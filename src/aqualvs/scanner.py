@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from aqualvs.errors import FrameError, OptionError
+from aqualvs.errors import FrameError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
@@ -107,6 +107,10 @@ class Scanner:
     def __init__(
         self, rig: Rig, options: ScannerOptions | None = None, camera: Camera | None = None
     ) -> None:
+        if not isinstance(rig, Rig):
+            raise RigError(
+                f"Scanner: rig is {rig!r}; give what aqualvs.load_rig makes of a rig file"
+            )
         self.rig = rig
         self.options = options or ScannerOptions()
         self._camera = camera

@@ -313,19 +313,9 @@ class FrameDetector:
         Raises
         ------
         FrameError
-            If the frame has another size, or is not of 8 bits.
+            If the frame has another size, or is not of 8 bits, or its chroma is not half as large.
         """
-        if frame.luma.dtype != np.uint8 or frame.luma.ndim != 2:
-            raise FrameError(
-                f"frame {frame.index} holds {frame.luma.dtype} of {frame.luma.ndim} dimensions but "
-                "expected uint8 of 2; convert it, colours by aqualvs.planes_of_image"
-            )
-        height, width = frame.luma.shape
-        if (width, height) != self._size_px:
-            raise FrameError(
-                f"frame {frame.index} is {width} x {height} px but the rig's image is "
-                f"{self._size_px[0]} x {self._size_px[1]} px; use the rig of this camera"
-            )
+        self._check(frame)
         if not self._bands:
             return FramePeaks()
         if isinstance(self._options, StripeOptions):
@@ -339,6 +329,38 @@ class FrameDetector:
         if self._field and SearchAxis.ALONG_Y in found:
             found[SearchAxis.ALONG_Y] = _in_picture(found[SearchAxis.ALONG_Y], self._field)
         return found
+
+    def _check(self, frame: Frame) -> None:
+        """Refuse a frame that kernels would read wrongly."""
+        luma = frame.luma
+        if not isinstance(luma, np.ndarray):
+            raise FrameError(
+                f"frame {frame.index} holds {type(luma).__name__} but expected an array of uint8; "
+                "give a picture as OpenCV reads it to aqualvs.planes_of_image"
+            )
+        if luma.dtype != np.uint8 or luma.ndim != 2:
+            raise FrameError(
+                f"frame {frame.index} holds {luma.dtype} of {luma.ndim} dimensions but "
+                "expected uint8 of 2; convert it, colours by aqualvs.planes_of_image"
+            )
+        height, width = luma.shape
+        if (width, height) != self._size_px:
+            raise FrameError(
+                f"frame {frame.index} is {width} x {height} px but the rig's image is "
+                f"{self._size_px[0]} x {self._size_px[1]} px; use the rig of this camera"
+            )
+        if frame.chroma is None:
+            return
+        # An array of both planes is no pair of them.
+        planes = frame.chroma if isinstance(frame.chroma, tuple | list) else [frame.chroma]
+        found = [(getattr(one, "dtype", None), getattr(one, "shape", None)) for one in planes]
+        half = self._chroma.shape[1:]
+        if found != [(np.uint8, half)] * 2:
+            words = ", ".join(f"{dtype} of shape {shape}" for dtype, shape in found)
+            raise FrameError(
+                f"frame {frame.index} has chroma {words} but expected a pair (U, V), both uint8 of "
+                f"shape {half}; make it by aqualvs.planes_of_image, or give None for a grey picture"
+            )
 
     def tallest(self, peaks: FramePeaks) -> FramePeaks:
         """Return the tallest peaks of a frame, fewer than the lasers can make.
