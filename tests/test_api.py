@@ -153,3 +153,9 @@ def test_luma_that_is_no_array_is_refused(luma) -> None:
     scanner = aqualvs.Scanner(aqualvs.load_rig(files("aqualvs") / "data" / "demo" / "rig.yaml"))
     with pytest.raises(aqualvs.AqualvsError, match=r"^frame 0 holds .*planes_of_image"):
         scanner.process(aqualvs.Frame(0, 0.0, luma))
+
+
+def test_an_unknown_model_of_a_lens_is_refused() -> None:
+    board = Path(__file__).parent / "data" / "real-wall" / "board.yaml"
+    with pytest.raises(aqualvs.AqualvsError, match="model is 'fish'; give one of opencv, fisheye"):
+        aqualvs.calibrate_camera([np.zeros((576, 720), np.uint8)], board, model="fish")

@@ -101,8 +101,9 @@ def test_a_folder_a_pattern_and_an_iterable_are_pictures(tmp_path):
         (np.zeros((8, 10), np.uint16), "picture 1: uint16 of shape"),
         (np.zeros((8, 10, 3), np.float32), "picture 1: float32 of shape"),
         (np.zeros((8, 10, 4), np.uint8), r"picture 1: uint8 of shape \(8, 10, 4\)"),
+        (7, "picture 1: int; give the path of a file"),
     ],
-    ids=["deep", "float", "transparent"],
+    ids=["deep", "float", "transparent", "number"],
 )
 def test_an_array_that_is_no_picture_of_8_bits_is_refused(picture, words):
     with pytest.raises(CalibrationError, match=words):

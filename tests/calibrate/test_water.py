@@ -28,11 +28,12 @@ def in_colour(light_nm):
 def calibrated(monkeypatch):
     """Calibrate the water for a rig, by a plate seen in green light."""
 
-    def run(rig):
+    def run(rig, collect=list):
         view = index_view(rig.in_water(index_in_seawater(*SEA, None, rig.n_air)))
         monkeypatch.setattr(water, "detect_markers", lambda *_: view)
         width, height = rig.size_px
-        return aqualvs.calibrate_water([np.zeros((height, width), np.uint8)], index_target(), rig)
+        pictures = collect([np.zeros((height, width), np.uint8)])
+        return aqualvs.calibrate_water(pictures, index_target(), rig)
 
     return run
 
@@ -69,3 +70,8 @@ def test_for_green_lasers_it_is_what_the_plate_shows(calibrated):
     assert done.rig.n_water == calibrated(in_colour(None)).rig.n_water
     assert not [note for note in done.notes if "dispersion" in note]
     assert "n_green" not in solved_steps(done.rig)["water"].extras
+
+
+@pytest.mark.parametrize("collect", [iter, np.stack])
+def test_pictures_may_come_one_by_one_or_in_one_array(calibrated, collect):
+    assert calibrated(example_rig(), collect).rig.n_water == calibrated(example_rig()).rig.n_water

@@ -9,7 +9,7 @@ from aqualvs.calibrate import common
 from aqualvs.calibration.camera.calibrate import CameraCalibration
 from aqualvs.calibration.camera.calibrate import camera as solve_camera
 from aqualvs.calibration.targets.targets import Board
-from aqualvs.errors import CalibrationError
+from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
@@ -66,6 +66,8 @@ def calibrate_camera(
     AqualvsError
         If a file, a picture or its content cannot be used.
     """
+    if model not in list(LensModel):
+        raise OptionError(f"model is {model!r}; give one of {', '.join(LensModel)}")
     known = (
         common.load_nominal(Path(nominal))
         if isinstance(nominal, str | Path)

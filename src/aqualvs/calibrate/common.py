@@ -354,11 +354,13 @@ def _picture_list(pictures: Pictures) -> list[Picture]:
         if one is None:
             remedy = "cv2.imread returns it for a file that it cannot read; check the path"
             raise CalibrationError(f"picture {i}: None; {remedy}")
-        if not isinstance(one, str | Path) and (
-            one.dtype != np.uint8 or (one.ndim != 2 and (one.ndim != 3 or one.shape[2] != 3))
-        ):
+        if isinstance(one, str | Path):
+            continue
+        shape, dtype = getattr(one, "shape", ()), getattr(one, "dtype", None)
+        if dtype != np.uint8 or len(shape) not in (2, 3) or shape[2:] not in ((), (3,)):
+            given = type(one).__name__ if dtype is None else f"{dtype} of shape {shape}"
             raise CalibrationError(
-                f"picture {i}: {one.dtype} of shape {one.shape}; give 8 bits (numpy.uint8), grey "
+                f"picture {i}: {given}; give the path of a file, or 8 bits (numpy.uint8), grey "
                 "(height, width) or blue, green, red (height, width, 3)"
             )
     return each

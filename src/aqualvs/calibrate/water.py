@@ -1,7 +1,6 @@
 """`aqualvs calibrate water`: the index of the water, from a target fixed on the vehicle."""
 
 import glob
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -54,7 +53,7 @@ class WaterRequest:
 
 
 def calibrate_water(
-    pictures: Sequence[common.Picture] | str | Path | FrameSource,
+    pictures: common.Pictures | FrameSource,
     target: MarkerSet | str | Path,
     rig: Rig | str | Path,
     *,
@@ -65,7 +64,7 @@ def calibrate_water(
 
     Parameters
     ----------
-    pictures : sequence of str, Path or array, a str or Path, or FrameSource
+    pictures : iterable of str, Path or array, a str or Path, or FrameSource
         Files or pixels (grey, or blue, green, red), one folder or pattern, or an opened video; of
         the size that the rig's camera has. Frames of a source have times, by which changes of the
         index are tracked.
@@ -90,7 +89,7 @@ def calibrate_water(
     """
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
     markers = target if isinstance(target, MarkerSet) else load_target(target)
-    if isinstance(pictures, Sequence | Path):
+    if not isinstance(pictures, FrameSource):
         found = common.detect_targets(
             pictures,
             lambda name, image: detect_markers(image, markers, name),

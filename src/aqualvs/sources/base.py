@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol, Self, cast
+from typing import Protocol, Self, cast, runtime_checkable
 
 import cv2
 import numpy as np
@@ -167,6 +167,7 @@ class Feed(Protocol):
         """End the iteration within a second; called from another thread."""
 
 
+@runtime_checkable
 class FrameSource(Protocol):
     """Frames in the order of their time; a context manager that can be iterated once.
 
