@@ -64,7 +64,8 @@ def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
 
 def net_warnings(net: NetTables | None) -> list[str]:
     """Return what the reader of the report should know about the net."""
-    if net is None or not any(net.summary.get(f"track_{what}") for what in ("slip_m", "breaks")):
+    told = ("track_slip_m", "track_breaks", "fast_frames")
+    if net is None or not any(net.summary.get(name) for name in told):
         return []
     # Imported here: it brings the evaluation of nets along, which few reports have.
     from aqualvs.nets.tables import track_warnings
