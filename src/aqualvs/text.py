@@ -110,8 +110,10 @@ def count_text(n: int, word: str, *, commas: bool = False) -> str:
     return f"{number} {word}" if n == 1 else f"{number} {word}s"
 
 
-def hole_count(n_holes: int) -> str:
-    """Return the number of holes as text."""
+def hole_count(n_holes: int, area_m2: float) -> str:
+    """Return the number of holes on an area of net as text: none of no area is no finding."""
+    if not n_holes and not area_m2:
+        return "not searched for holes"
     return "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"
 
 

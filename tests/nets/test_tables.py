@@ -267,10 +267,18 @@ def test_summary_in_words(wall):
     assert net_lines(walled([]), 0.0, 30) == ["no net was seen in 30 frames"]
 
 
-def test_summary_of_a_net_whose_mesh_nobody_could_make_out():
-    said = net_lines(walled([stretch(0, (0.0, 0.0), seen=False)]), 0.0, 30)
+def test_summary_of_a_net_whose_mesh_nobody_could_make_out(tmp_path):
+    wall = walled([stretch(0, (0.0, 0.0), seen=False)])
+    said = net_lines(wall, 0.0, 30)
     assert said[0] == "net: its mesh could not be determined"
     assert said[1] == "solidity: not measured in any stretch"
+    # Nothing was looked at: that is no sound net.
+    assert said[2] == "looked at 0.00 m² of net over 0.0 m: not searched for holes"
+    dive = make_dive(tmp_path / "run", video=False)
+    write_net_files(dive.folder, wall, {"summary": net_dict(wall, 0.0, 30, 30)})
+    net, _ = read_net(dive.folder)
+    assert net_cards(net)[0].value == "holes not known"
+    assert "<p>Not searched for.</p>" in net_view(net)
 
 
 def test_report_shows_the_net_of_its_folder(wall, tmp_path):

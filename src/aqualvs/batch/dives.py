@@ -375,7 +375,7 @@ class DiveRecord:
             return ""
         if not self.net["n_stretches"]:
             return "no net seen"
-        holes, fouling = hole_count(self.net["n_holes"]), self.net["fouling"]
+        holes, fouling = hole_count(self.net["n_holes"], self.net["area_m2"]), self.net["fouling"]
         # Adding zero turns a negative zero into a plain one.
         return holes if fouling is None else f"fouling {round(fouling, 2) + 0.0:+.2f}, {holes}"
 

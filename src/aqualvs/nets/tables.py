@@ -461,7 +461,7 @@ def _fouling_line(wall: UnrolledNet, facts: dict[str, Any]) -> str:
 def _hole_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     n = len(wall.holes)
     area, way, max_listed = facts["area_m2"], facts["way_m"], 20
-    lines = [f"looked at {area:.2f} m² of net over {way:.1f} m: {hole_count(n)}"]
+    lines = [f"looked at {area:.2f} m² of net over {way:.1f} m: {hole_count(n, area)}"]
     order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:max_listed]
     for i in sorted(order):
         hole, place = wall.holes[i], wall.places.holes[i]

@@ -41,6 +41,11 @@ class NetTables:
         """The dive in a few numbers; empty where `net.geojson` is missing."""
         return mapping(self.facts, "summary")
 
+    @property
+    def searched(self) -> bool:
+        """Whether holes were searched for: a net whose mesh is not known has no place for them."""
+        return self.summary.get("area_m2") != 0.0 or bool(self.holes)
+
 
 def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
     """Read the state of a net from a run's folder, None where it holds none.
@@ -79,7 +84,7 @@ def net_cards(net: NetTables | None) -> list[Card]:
         return []
     n, words = len(net.holes), []
     value = count_text(n, "hole") if n else "no holes"
-    if not net.holes_known:
+    if not net.holes_known or not net.searched:
         value = "holes not known"
     largest = max((_number(row, "diameter_mm") or 0.0 for row in net.holes), default=0.0)
     if largest:
@@ -153,7 +158,8 @@ def _map(net: NetTables) -> str:
 
 def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
     if not net.holes:
-        said = "None was found." if net.holes_known else "Not known: holes.csv is damaged."
+        said = "None was found." if net.searched else "Not searched for."
+        said = said if net.holes_known else "Not known: holes.csv is damaged."
         return f"<h3>Holes</h3><p>{said}</p>"
     names = (
         *("hole", "diameter, mm", "width × height, mm", "meshes", *_PLACE_HEAD),
