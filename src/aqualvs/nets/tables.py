@@ -404,8 +404,9 @@ def track_warnings(summary: Mapping[str, Any]) -> list[str]:
     if n_fast > good_part * n_frames:
         words.append(
             f"the net moves by about half a mesh or more from frame to frame in {int(n_fast)} of "
-            f"{count_text(int(n_frames), 'frame')}: meshes may be miscounted, so that places are "
-            "unreliable; move slower, or record more frames per second"
+            f"{count_text(int(n_frames), 'frame')}: meshes may be miscounted, so that places, "
+            "and number and sizes of holes, are unreliable; move slower, or record more frames per "
+            "second"
         )
     return words
 
