@@ -2,11 +2,14 @@
 
 import threading
 
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
 from aqualvs.batch.dataset import (
     MANIFEST,
     drafted,
+    put_dive,
     read_manifest,
     read_valid_manifest,
     write_manifest,
@@ -83,3 +86,23 @@ def test_new_work_takes_the_place_of_damaged_work(finished):
         write_manifest(draft, "key", {"n": 4}, ["rows.csv"])
     assert read_valid_manifest(finished, "key") == {"n": 4}
     assert read_manifest(finished)["files"]["rows.csv"][0] == 10
+
+
+def test_postures_of_whole_pictures_and_of_fields_have_one_schema(tmp_path):
+    rows = {
+        "fields": "frame,valid,reason,range_m,field\n0,1,,0.6,top\n1,0,no_stripes,,bottom\n",
+        "whole": "frame,valid,reason,range_m\n0,1,,0.6\n1,0,no_stripes,\n",
+    }
+    found = {}
+    for name, text in rows.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "posture.csv").write_text(text)
+        (folder / "points.parquet").write_bytes(b"points")
+        put_dive(tmp_path / "dataset", name, folder)
+        place = tmp_path / "dataset" / "posture" / f"dive={name}" / "posture.parquet"
+        found[name] = parquet.ParquetFile(place).read()
+    assert found["fields"].schema == found["whole"].schema
+    assert found["fields"].schema.field("field").type == pa.string()
+    assert found["fields"]["field"].to_pylist() == ["top", "bottom"]
+    assert found["whole"]["field"].to_pylist() == [None, None]

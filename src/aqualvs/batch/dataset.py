@@ -137,9 +137,11 @@ _COUNTS = (
 )
 # Of columns in CSV files; all others hold numbers.
 _TYPES = dict.fromkeys(_COUNTS, pa.int32()) | {
-    **dict.fromkeys(("reason", "mesh", "placed_by"), pa.string()),
+    **dict.fromkeys(("reason", "mesh", "placed_by", "field"), pa.string()),
     "valid": pa.bool_(),
 }
+# Columns that only some dives have, and nulls in the others: readers expect one schema.
+_OF_SOME = {POSTURE_CSV: ("field",)}
 OF_DIVE, OF_NET = (POSTURE_CSV, POINTS_PARQUET), (NET_CSV, HOLES_CSV)
 """Files of a run that are tables of the data set: of its dive, and of its net."""
 NET_FACTS = ("area_m2", "bar_mm", "twine_mm", "solidity", "fouling", "largest_hole_mm")
@@ -201,8 +203,11 @@ def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> Non
     """Put a CSV file into the data set; numbers that are not there are null, words if wanted."""
     with path.open(encoding="utf-8") as file:
         columns = file.readline().rstrip("\n").split(",")
+    columns += [column for column in _OF_SOME.get(path.name, ()) if column not in columns]
     convert = csv.ConvertOptions(
         column_types={column: _TYPES.get(column, pa.float64()) for column in columns},
+        include_columns=columns,
+        include_missing_columns=True,
         null_values=[""],
         strings_can_be_null=null_words,
         true_values=["1"],
