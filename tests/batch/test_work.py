@@ -91,6 +91,16 @@ def test_it_is_in_the_data_set_and_on_the_page(told):
     assert f'<a href="dives/dive/net_map.png" title="map of the net">{record.net_text()}' in page
 
 
+def test_a_net_that_moves_too_fast_for_its_track_is_warned_of(told):
+    folder, _, record, _ = told
+    words = "meshes may be miscounted"
+    assert words not in record.line()
+    net = {**record.net, "fast_frames": record.net["n_net_frames"]}
+    record = replace(record, facts={**record.facts, "net": net})
+    assert "; warning: the net moves by about half a mesh" in record.line()
+    assert words in write_summary(folder, [record]).read_text()
+
+
 def test_another_batch_takes_it_as_it_is(finished):
     out = finished.request.out
     before = {name: (out / name).stat().st_mtime_ns for name in NET_FILES}

@@ -29,6 +29,7 @@ from aqualvs.batch.dataset import NET_FACTS
 from aqualvs.errors import OptionError, RigError, SourceError, check_commas
 from aqualvs.optics.water import water_fault
 from aqualvs.recording import is_recording
+from aqualvs.report.net import net_warnings
 from aqualvs.results.folder import RUN_YAML
 from aqualvs.results.run_request import Water, checked_index
 from aqualvs.sources.images import VIDEO_SUFFIXES, is_image_name, natural_key
@@ -360,8 +361,8 @@ class DiveRecord:
 
     @property
     def warnings(self) -> list[str]:
-        """Return what is wrong with source or rig, as `run` warns of it."""
-        return list(self.summary.get("warnings", []))
+        """Return what is wrong with source, rig or track, as `run` and `net` warn of it."""
+        return [*self.summary.get("warnings", []), *net_warnings(self.net)]
 
     @property
     def net(self) -> Mapping[str, Any]:

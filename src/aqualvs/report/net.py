@@ -67,15 +67,14 @@ def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
     return replace(net, holes=[], holes_known=False), words
 
 
-def net_warnings(net: NetTables | None) -> list[str]:
-    """Return what the reader of the report should know about the net."""
-    told = ("track_slip_m", "track_breaks", "fast_frames")
-    if net is None or not any(net.summary.get(name) for name in told):
+def net_warnings(summary: Mapping[str, Any]) -> list[str]:
+    """Return why places and holes of a net are not to be trusted, by its summary, or by none."""
+    if not any(summary.get(name) for name in ("track_slip_m", "track_breaks", "fast_frames")):
         return []
     # Imported here: it brings the evaluation of nets along, which few reports have.
     from aqualvs.nets.tables import track_warnings
 
-    return [f"Net: {words}." for words in track_warnings(net.summary)]
+    return track_warnings(summary)
 
 
 def net_cards(net: NetTables | None) -> list[Card]:

@@ -151,7 +151,11 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
             for place, row in holes.items()
             if row in decoded
         },
-        warnings=[*filter(None, missing), *warnings, *net_warnings(net)],
+        warnings=[
+            *filter(None, missing),
+            *warnings,
+            *(f"Net: {words}." for words in net_warnings(net.summary if net else {})),
+        ],
     )
 
 
