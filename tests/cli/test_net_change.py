@@ -147,6 +147,19 @@ def test_without_a_log_whole_dives_are_compared_and_it_says_so(cage, tmp_path, c
     )
 
 
+def test_a_net_that_was_not_searched_has_no_number_of_holes(cage, tmp_path, capsys):
+    """Its mesh was not found on one date: no hole of it is known, and none is denied."""
+    before = dive(replace(cage, holes=[]), 0, log=False)
+    blind = {**before.facts, "summary": {**before.facts["summary"], "area_m2": 0.0}}
+    write(replace(before, facts=blind), tmp_path / "2026-05-01")
+    written(cage, tmp_path / "2026-05-22", 21, log=False)
+    runs = [str(tmp_path / name) for name in ("2026-05-01", "2026-05-22")]
+    assert main(["net-change", *runs, "-o", str(tmp_path / "out")]) == 0
+    assert "holes: 2026-05-01: not searched for, 2026-05-22: 4;" in capsys.readouterr().out
+    page = (tmp_path / "out" / "net_change.html").read_text(encoding="utf-8")
+    assert "not searched for</td>" in page
+
+
 def test_dives_without_any_solidity_are_no_fault(cage, tmp_path, capsys):
     """Too few strands in every stretch: there is no mean to draw for any date."""
     runs = []

@@ -344,7 +344,8 @@ def _dives(result: Comparison, origins: Mapping[str, str]) -> html.Raw:
     rows = [
         (
             *(str(survey.folder), survey.date.isoformat(), origins.get(str(survey.folder), "")),
-            *(str(len(survey.stretches.along)), str(len(survey.holes.number))),
+            str(len(survey.stretches.along)),
+            str(len(survey.holes.number)) if survey.searched else "not searched for",
             *shifts.get(survey.folder, (_NONE, _NONE)),
         )
         for survey in result.surveys

@@ -153,6 +153,12 @@ class Survey:
         """Name of the survey in messages."""
         return self.folder.name or str(self.folder)
 
+    @property
+    def searched(self) -> bool:
+        """Whether holes were searched for: a net whose mesh is not known has no place for them."""
+        looked = self.facts.get("summary", {}).get("area_m2")
+        return looked != 0.0 or len(self.holes.number) > 0
+
 
 def find_runs(folder: Path) -> list[Path]:
     """Return the runs that a folder is or, as that of a batch, holds.

@@ -96,10 +96,11 @@ def _whole_line(result: Comparison) -> str:
 
 
 def _hole_counts(result: Comparison) -> str:
-    counts = [
-        f"{day}: {sum(len(s.holes.number) for s in result.surveys if s.date == day)}"
-        for day in result.dates
-    ]
+    counts = []
+    for day in result.dates:
+        searched = [s for s in result.surveys if s.date == day and s.searched]
+        n = sum(len(s.holes.number) for s in searched)
+        counts.append(f"{day}: {n if searched else 'not searched for'}")
     return f"holes: {', '.join(counts)}; without positions it is unknown which are the same"
 
 
