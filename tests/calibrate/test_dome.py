@@ -2,14 +2,23 @@
 
 from dataclasses import MISSING, fields, replace
 
+import numpy as np
 import pytest
 
-from aqualvs.calibrate.common import WATER_N
+import aqualvs
+from aqualvs.calibrate import common
+from aqualvs.calibrate.common import WATER_N, DetectedTargets
 from aqualvs.calibrate.dome import DomeRequest, _with_housing
+from aqualvs.calibration.dome.problem import DomeOptions
 from aqualvs.errors import OptionError
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
+from aqualvs.optics.solved import rig_uncertainty, with_uncertainty
+from aqualvs.optics.water import Dispersion
 from aqualvs.simulation.scenarios import example_rig, flat_port_rig
+from dome_cases import INTRINSICS, board_points, see
 
 
 def request(**given):
@@ -54,3 +63,26 @@ def test_options_change_a_flat_port_that_is_there():
 def test_options_of_another_housing_are_refused(rig, given, words):
     with pytest.raises(OptionError, match=words):
         _with_housing(rig, request(**given))
+
+
+@pytest.mark.parametrize("light_nm", [None, 450.0, 640.0])
+def test_boards_in_water_give_the_index_for_the_light_of_the_lasers(monkeypatch, light_nm):
+    true, light = flat_port_rig().in_water(1.3412), Dispersion.of(light_nm)
+    rng, points, views = np.random.default_rng(0), board_points(13, 10), []
+    for i, distance in enumerate(np.linspace(0.2, 0.9, 8)):
+        turn = rotation_from_rotvec(rng.normal(0.0, 0.35, 3)) @ DOME_FROM_CAM_NOMINAL
+        pose = SE3(turn, np.array([0.0, distance, 0.0]) - turn @ points.mean(axis=0))
+        # In green light.
+        views.append(see(true.camera(), pose, points, rng, name=f"view_{i}"))
+    found = DetectedTargets(tuple(views), (), true.size_px, {})
+    monkeypatch.setattr(common, "detect_boards", lambda *_: found)
+    planned = {} if light_nm is None else {common.WAVELENGTH_NM: light_nm}
+    start = replace(true.in_water(WATER_N), lasers=(), solved_from=planned)
+    start = with_uncertainty(start, INTRINSICS)
+    options = DomeOptions(check_cross_validation=False)
+    done = aqualvs.calibrate_dome([], "board", start, medium="water", options=options)
+    sigma = done.uncertainty.sigmas["n_water"]
+    assert sigma < 8e-4
+    assert done.rig.n_water == pytest.approx(light.from_green(1.3412), abs=3.0 * sigma)
+    assert rig_uncertainty(done.rig).sigmas["n_water"] == pytest.approx(sigma, rel=1e-3)
+    assert any("dispersion" in note for note in done.notes) is (light_nm is not None)

@@ -24,6 +24,7 @@ from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.solver.result import DomeCalibration, ViewFit, rms_px
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board, View
+from aqualvs.calibration.water_index.estimator import N_WATER
 from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
@@ -32,7 +33,7 @@ from aqualvs.optics.rig import Rig, RigUncertainty, common_wavelength
 from aqualvs.optics.rigfile import housing_of, keep_dated, load_rig, save_rig, shutter_from_part
 from aqualvs.optics.rigschema import LaserWavelength, ShutterPart, range_fault
 from aqualvs.optics.shutter import AT_ONCE, Shutter
-from aqualvs.optics.water import N_AIR
+from aqualvs.optics.water import N_AIR, Dispersion
 from aqualvs.report.calibration_material import (
     CalibrationPage,
     ResidualMap,
@@ -164,6 +165,19 @@ def lasers_wavelength(rig: Rig) -> float | None:
     if not rig.lasers and isinstance(planned, int | float):
         return float(planned)
     return common_wavelength(rig.lasers)
+
+
+def in_lasers_light(
+    rig: Rig, known: RigUncertainty, light: Dispersion
+) -> tuple[Rig, RigUncertainty]:
+    """Return a rig, and its uncertainty, whose index was found in green light, for its lasers'."""
+    scale = np.array([light.ratio if name == N_WATER else 1.0 for name in known.names])
+    covariance = known.covariance * np.outer(scale, scale)
+    if N_WATER in known.names:
+        index = known.names.index(N_WATER)
+        covariance[index, index] = light.sigma(rig.n_water, known.sigmas[N_WATER]) ** 2
+    there = rig.in_water(light.from_green(rig.n_water))
+    return there, RigUncertainty(known.names, covariance)
 
 
 def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:

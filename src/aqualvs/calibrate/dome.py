@@ -27,6 +27,7 @@ from aqualvs.optics.solved import (
     with_step,
     with_uncertainty,
 )
+from aqualvs.optics.water import Dispersion
 from aqualvs.report.calibration_material import CalibrationPage, expectations, facts, parameter_rows
 from aqualvs.report.html import Card
 from aqualvs.terminal import Echo
@@ -126,13 +127,17 @@ def calibrate_dome(
         If a file, a picture or its content cannot be used.
     """
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
+    light_nm = common.lasers_wavelength(before)
+    light = Dispersion.of(light_nm, before.n_air)
+    # A camera sees the boards in green or white light, whatever the colour of the lasers.
+    green = before.in_water(light.to_green(before.n_water))
     first = _board_set(
-        pictures, board, poses, before, common.medium_index(medium, before, before.n_air)
+        pictures, board, poses, before, common.medium_index(medium, green, green.n_air)
     )
     sets = [first]
     if water_pictures:
         in_water = water_board or board
-        sets.append(_board_set(water_pictures, in_water, water_poses, before, before.n_water))
+        sets.append(_board_set(water_pictures, in_water, water_poses, before, green.n_water))
     elif water_board is not None or water_poses is not None:
         raise OptionError("--water-images: missing; --water-board and --water-poses need them")
     known = rig_uncertainty(before)
@@ -142,7 +147,8 @@ def calibrate_dome(
         known = merged(known, given)
     found = tuple(one for one, _ in sets)
     with common.counting_missed(*found):
-        result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
+        seen = solve_dome(green, [one for _, one in sets], options or DomeOptions(), known)
+    result = seen if light.ratio == 1.0 else _in_light(seen, light, light_nm, before)
     missed = {name: why for one in found for name, why in one.missed.items()}
     return common.Calibration(
         rig=_solved_rig(before, result),
@@ -241,6 +247,21 @@ def _board_set(
         sigma_medium=0.0 if in_air else rig_uncertainty(rig).sigmas.get("n_water", SIGMAS.n_water),
     )
     return found, board_set
+
+
+def _in_light(
+    seen: DomeCalibration, light: Dispersion, light_nm: float | None, before: Rig
+) -> DomeCalibration:
+    """Return a result for green light with the index for a wavelength in nm."""
+    if "n_water" not in seen.uncertainty.names:
+        return replace(seen, rig=seen.rig.in_water(before.n_water))
+    rig, uncertainty = common.in_lasers_light(seen.rig, seen.uncertainty, light)
+    remark = (
+        f"water for the lasers' {light_nm:g} nm: n = {rig.n_water:.5f} ± "
+        f"{uncertainty.sigmas['n_water']:.5f}, by the dispersion of water; the boards are seen in "
+        "green or white light"
+    )
+    return replace(seen, rig=rig, uncertainty=uncertainty, findings=(*seen.findings, remark))
 
 
 def _solved_rig(rig: Rig, result: DomeCalibration) -> Rig:

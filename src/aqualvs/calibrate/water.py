@@ -14,7 +14,7 @@ from aqualvs.calibration.water_index.estimator import N_WATER, WaterCalibration
 from aqualvs.calibration.water_index.estimator import calibrate_water as solve_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior
 from aqualvs.errors import CalibrationError, check_options
-from aqualvs.optics.rig import Rig, RigUncertainty, merged
+from aqualvs.optics.rig import Rig, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import SolvedStep, rig_uncertainty, with_step, with_uncertainty
 from aqualvs.optics.water import Dispersion
@@ -192,20 +192,16 @@ def _in_light(seen: WaterCalibration, light_nm: float | None) -> WaterCalibratio
     light = Dispersion.of(light_nm, seen.rig.n_air)
     if light.ratio == 1.0:
         return seen
-    known, sigma = seen.uncertainty, light.sigma(seen.n, seen.sigma)
-    scale = np.array([light.ratio if name == N_WATER else 1.0 for name in known.names])
-    covariance = known.covariance * np.outer(scale, scale)
-    index = known.names.index(N_WATER)
-    covariance[index, index] = sigma**2
+    rig, uncertainty = common.in_lasers_light(seen.rig, seen.uncertainty, light)
     remark = (
         f"the target, seen in green or white light, gives {seen.n:.5f} ± {seen.sigma:.5f}; from "
         f"it follows the index for the lasers' {light_nm:g} nm, by the dispersion of water"
     )
     return replace(
         seen,
-        rig=seen.rig.in_water(light.from_green(seen.n)),
-        uncertainty=RigUncertainty(known.names, covariance),
-        sigma=sigma,
+        rig=rig,
+        uncertainty=uncertainty,
+        sigma=uncertainty.sigmas[N_WATER],
         remarks=(remark, *seen.remarks),
     )
 

@@ -290,13 +290,19 @@ def _camera_air(job: _Job) -> tuple[Path, Path]:
     return folder, file
 
 
+def _in_green(rig: Rig) -> Rig:
+    """Return the rig for green light, in which a camera sees boards, whatever its lasers."""
+    light = Dispersion.of(common_wavelength(rig.lasers), rig.n_air)
+    return rig.in_water(light.to_green(rig.n_water))
+
+
 def port_folder(rig: Rig) -> str:
     """Return the name of the folder of boards before the housing."""
     return "dome_air" if rig.flat_port is None else "port_water"
 
 
 def _port_water(job: _Job) -> tuple[Path, Path, None]:
-    rig, rng, folder = job.rig, job.rng(1), job.folder(port_folder(job.rig))
+    rig, rng, folder = _in_green(job.rig), job.rng(1), job.folder(port_folder(job.rig))
     board, lens = targets.hand_board(rig.size_px[0]), rig.lens
     # Water magnifies what a flat port shows.
     longer = replace(lens, fx=rig.n_water * lens.fx, fy=rig.n_water * lens.fy)
@@ -343,10 +349,7 @@ def _box(job: _Job) -> tuple[Path, Path]:
 
 
 def _index(job: _Job) -> tuple[Path, Path]:
-    # A camera sees the plate in green light, whatever the colour of the lasers.
-    light = Dispersion.of(common_wavelength(job.rig.lasers), job.rig.n_air)
-    rig = job.rig.in_water(light.to_green(job.rig.n_water))
-    rng, folder = job.rng(3), job.folder("index", "clip_0")
+    rig, rng, folder = _in_green(job.rig), job.rng(3), job.folder("index", "clip_0")
     plate = targets.plate_before(rig, _PLATE_FAR)
     scenes = [targets.plate_scene(plate, i, _WATER) for i in range(job.size.index)]
     job.shoot(job.with_lasers(rig), scenes, folder, rng, "frame_{:03d}")
