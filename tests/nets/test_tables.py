@@ -281,6 +281,13 @@ def test_summary_of_a_net_whose_mesh_nobody_could_make_out(tmp_path):
     assert "<p>Not searched for.</p>" in net_view(net)
 
 
+def test_what_rounds_to_zero_has_no_sign(wall):
+    one = replace(stretch(0, (STEP, -0.001)), solidity=0.1899)
+    said = "\n".join(net_lines(walled([one], [hole(1.0, (0.2, -0.001))]), 1.0, 62))
+    assert "-0.00" not in said
+    assert "+0.00" not in said
+
+
 def test_report_shows_the_net_of_its_folder(wall, tmp_path):
     dive = make_dive(tmp_path / "run", video=False)
     page = write_report(dive.folder).read_text(encoding="utf-8")

@@ -33,7 +33,7 @@ from aqualvs.report.net import net_warnings
 from aqualvs.results.folder import RUN_YAML
 from aqualvs.results.run_request import Water, checked_index
 from aqualvs.sources.images import VIDEO_SUFFIXES, is_image_name, natural_key
-from aqualvs.text import count_text, hole_count
+from aqualvs.text import count_text, hole_count, with_sign
 from aqualvs.yamlfile import parse_yaml, read_text
 
 _LONGEST = 80
@@ -377,8 +377,7 @@ class DiveRecord:
         if not self.net["n_stretches"]:
             return "no net seen"
         holes, fouling = hole_count(self.net["n_holes"], self.net["area_m2"]), self.net["fouling"]
-        # Adding zero turns a negative zero into a plain one.
-        return holes if fouling is None else f"fouling {round(fouling, 2) + 0.0:+.2f}, {holes}"
+        return holes if fouling is None else f"fouling {with_sign(fouling, 2)}, {holes}"
 
     def line(self) -> str:
         """Return the dive in one line."""

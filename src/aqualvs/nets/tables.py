@@ -25,7 +25,7 @@ from aqualvs.nets.lattice import START_FRAMES
 from aqualvs.nets.lit_intervals import net_from_dome
 from aqualvs.nets.places import DivePostures, NetPlace, NetPlaces, PlacedBy
 from aqualvs.optics.rig import Rig
-from aqualvs.text import clock, count_text, hole_count
+from aqualvs.text import clock, count_text, hole_count, with_sign
 
 # Bands meet in one edge where the cosine of the turn between them is above this.
 _SHARP = 0.5
@@ -425,7 +425,7 @@ def place_text(place: NetPlace) -> str:
     """Return where something is."""
     words = [] if place.placed_by == "nothing" else [f"{place.along:.2f} m along"]
     words.append(
-        f"{place.depth:.2f} m deep" if place.depth is not None else f"{place.up:+.2f} m up"
+        f"{place.depth:.2f} m deep" if place.depth is not None else f"{with_sign(place.up, 2)} m up"
     )
     if place.bearing is not None:
         words.append(f"bearing {np.rad2deg(place.bearing):.0f}°")
@@ -450,12 +450,12 @@ def _fouling_line(wall: UnrolledNet, facts: dict[str, Any]) -> str:
     if facts["fouling"] is None:
         return "solidity: not measured in any stretch"
     clean = facts["solidity"] - facts["fouling"]
-    fouling = [fouling_of(one) for one in wall.stretches]
-    worst = int(np.argmax([-np.inf if value is None else value for value in fouling]))
+    fouling = [-np.inf if (value := fouling_of(one)) is None else value for one in wall.stretches]
+    worst = int(np.argmax(fouling))
     return (
         f"solidity {facts['solidity']:.2f}, of bare twine {clean:.2f}: "
-        f"fouling {facts['fouling']:+.2f}; most at {place_text(wall.places.middle[worst])}: "
-        f"{fouling[worst]:+.2f}"
+        f"fouling {with_sign(facts['fouling'], 2)}; most at "
+        f"{place_text(wall.places.middle[worst])}: {with_sign(fouling[worst], 2)}"
     )
 
 

@@ -13,7 +13,7 @@ from aqualvs.report.html import Card, Raw, data_url, folded, table, text
 from aqualvs.report.run_data import mapping
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
-from aqualvs.text import clock, count_text, signed
+from aqualvs.text import clock, count_text, signed, with_sign
 
 _LONG_TABLE = 12
 _NONE = "–"
@@ -92,7 +92,7 @@ def net_cards(net: NetTables | None) -> list[Card]:
     if isinstance(solidity, float):
         words.append(f"solidity {solidity:.2f}")
     if isinstance(fouling, float):
-        words.append(signed(f"fouling {fouling:+.2f}"))
+        words.append(signed(f"fouling {with_sign(fouling, 2)}"))
     return [Card("Net", value, "; ".join(words) or "solidity not measured")]
 
 
