@@ -160,6 +160,19 @@ def test_a_net_that_was_not_searched_has_no_number_of_holes(cage, tmp_path, caps
     assert "not searched for</td>" in page
 
 
+def test_the_page_names_the_folder_of_a_warning_as_it_is(cage, tmp_path, capsys, monkeypatch):
+    """A slipped track: the warning begins with the folder, in whatever letters it is written."""
+    one = dive(cage, 0, bearings=(0.0, 80.0))
+    facts = {**one.facts, "summary": {**one.facts["summary"], "track_slip_m": 1.2}}
+    write(replace(one, facts=facts), tmp_path / "cage 2026-05-01")
+    write(dive(cage, 21, bearings=(0.0, 80.0)), tmp_path / "cage 2026-05-22")
+    monkeypatch.chdir(tmp_path)
+    assert main(["net-change", "cage 2026-05-01", "cage 2026-05-22", "-o", "out"]) == 0
+    assert "warning: cage 2026-05-01: " in capsys.readouterr().out
+    page = (tmp_path / "out" / "net_change.html").read_text(encoding="utf-8")
+    assert "<li>cage 2026-05-01: " in page
+
+
 def test_dives_without_any_solidity_are_no_fault(cage, tmp_path, capsys):
     """Too few strands in every stretch: there is no mean to draw for any date."""
     runs = []

@@ -254,13 +254,17 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
     `origins`: folder of a run to what told its date. Raises `OSError` as the system says it.
     """
     first, last = result.dates[0], result.dates[-1]
+    folders = tuple(str(one.folder) for one in result.surveys)
     lines = [line for line in summary_lines(result) if not line.startswith("warning: ")]
     content = {
         "title": f"The net from {first} to {last}",
         "subtitle": dives_text(result),
         "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
         "cards": html.cards(_cards(result)),
-        "warnings": html.notice([sentence(one) for one in result.warnings]),
+        "warnings": html.notice(
+            # A path keeps its letters.
+            [f"{one}." if one.startswith(folders) else sentence(one) for one in result.warnings]
+        ),
         # Minus signs, but the hyphens of dates stay.
         "sentences": [_MINUS.sub("\u2212", line.replace("->", "\u2192")) for line in lines],
         "picture": html.data_url(picture.read_bytes(), "png"),
