@@ -89,7 +89,8 @@ class Scanner:
     """The scanner of one rig: frames in, postures out, each from its frame alone.
 
     Frames of an interlaced camera are fields (`Shutter.field_of`); their points are in pixels of
-    the whole picture, whose camera model holds.
+    the whole picture, whose camera model holds. A single frame of a rolling shutter hardly shows
+    the vehicle's motion: its sigma includes how such vehicles move; `run` uses the frames beside.
 
     `process` may be called from any thread, but measures one frame at a time; threads that are to
     measure at once need a scanner each. Copies and pickles are made anew of the same arguments.
@@ -171,10 +172,11 @@ class Scanner:
                 "aqualvs.Frame(index, time_s, *aqualvs.planes_of_image(image))"
             )
         with self._lock:
-            return self.scan(frame)[1]
+            scan = self.scan(frame)[1]
+        return scan if self._row_motion is None else self._row_motion.correct(scan, ())
 
     def scan(self, frame: Frame) -> tuple[FramePeaks, Scan]:
-        """Return the peaks of a frame as well as what `process` does. Raises as `detect`."""
+        """Return the peaks of a frame and its scan, as the rows are exposed. Raises as `detect`."""
         peaks = self.detect(frame)
         return self.without_colour(frame, peaks, self.measure(frame.index, frame.time_s, peaks))
 

@@ -57,7 +57,7 @@ def frames():
 @pytest.fixture(scope="module")
 def scans(frames):
     scanner = Scanner(ROLLING)
-    return [scanner.process(frame) for frame in frames]
+    return [scanner.scan(frame)[1] for frame in frames]
 
 
 def error(scan, i):
@@ -79,6 +79,14 @@ def test_a_posture_is_that_of_the_pictures_middle(scans):
     sigma = np.sqrt(np.diag(found.posture.covariance))
     assert np.all(np.abs(found.posture.numbers - truth(2)) < 3.0 * sigma)
     assert found.posture.by_motion is None
+
+
+def test_the_sigma_of_a_frame_alone_includes_how_vehicles_move(frames, scans):
+    found = Scanner(ROLLING).process(frames[2]).posture
+    assert found.by_motion is None
+    off = np.abs(found.numbers - truth(2))
+    assert np.any(off > 3.0 * np.sqrt(np.diag(scans[2].posture.covariance)))
+    assert np.all(off < 3.0 * np.sqrt(np.diag(found.covariance)))
 
 
 def test_a_picture_turned_upside_down_has_a_negative_readout(frames, scans):
@@ -103,7 +111,7 @@ def test_a_picture_turned_upside_down_has_a_negative_readout(frames, scans):
         luma, *chroma = (
             np.ascontiguousarray(one[::-1, ::-1]) for one in (frame.luma, *frame.chroma)
         )
-        return scanner.process(replace(frame, luma=luma, chroma=tuple(chroma)))
+        return scanner.scan(replace(frame, luma=luma, chroma=tuple(chroma)))[1]
 
     found = [upside_down(frame) for frame in frames]
     correct = RowMotion(rig).correct(found[2], [*found[:2], *found[3:]])
@@ -131,7 +139,7 @@ def test_the_rates_by_one_frame_leave_no_trace(frames, scans, monkeypatch):
         return m, m_rate + 0.3 / truth(2)[0] * m
 
     monkeypatch.setattr(row_motion, "_fit_rates", other_rates)
-    found = Scanner(ROLLING).process(frames[2]).posture
+    found = Scanner(ROLLING).scan(frames[2])[1].posture
     assert abs(found.by_motion[1, 0] * 0.3) > np.deg2rad(1.0)
     off = (found.numbers - scans[2].posture.numbers) / [1e-3 * truth(2)[0], *2 * [np.pi / 180.0]]
     assert np.all(np.abs(off) < [0.03, 0.006, 0.006])

@@ -102,7 +102,7 @@ def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
     warps: list[_Warp] = []
     with progress(f"measuring {source.name}", source.n_frames) as tick:
         for frame in source:
-            scan = scanner.process(frame)
+            _, scan = scanner.scan(frame)
             equations = _warp(scan, rig.size_px[1])
             if equations is not None:
                 warps.append(_Warp(len(scans), scan.time_s, *equations))

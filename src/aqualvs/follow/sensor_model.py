@@ -19,6 +19,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.row_motion import REACH, RowMotion
 from aqualvs.scanning.scan import Frame, Planes, Scan, planes_of_image
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.net_motion import NetPosture, NetWall
@@ -53,6 +54,8 @@ class RenderedSensor:
         self._scene = scene or Scene(dome_from_scene=SE3.identity(), nets=nets, target="net")
         self._renderer = Renderer(rig, camera=camera)
         self._scanner = Scanner(rig)
+        self._row_motion = RowMotion(rig)
+        self._before: deque[Scan] = deque(maxlen=REACH)
         self._n_frames = 0
         self._freeze_s = freeze_s
         self._frozen: dict[Field | None, FrozenPicture] = {}
@@ -73,7 +76,9 @@ class RenderedSensor:
         still_s = self._frozen.setdefault(field, FrozenPicture()).update(time_s, frame.luma)
         if still_s > 0.0:
             return Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s", still_s)
-        scan = self._scanner.process(frame)
+        _, seen = self._scanner.scan(frame)
+        scan = self._row_motion.correct(seen, self._before)
+        self._before.append(seen)
         self.shots.append((frame, scan))
         return scan.posture
 
