@@ -26,7 +26,7 @@ from aqualvs.results.run_request import (
     scanner_options,
 )
 from aqualvs.results.summary import compare_with_truth
-from aqualvs.scanner import ScannerOptions
+from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.sources import open_source
 from aqualvs.terminal import StopSignals
 from rerun_stand_in import replace_sdk
@@ -82,6 +82,18 @@ def test_every_frame_is_measured_and_written(request_for, dive):
             assert float(row["range_m"]) == pytest.approx(luma_level(i) / 100, abs=0.04)
     assert parquet.read_table(request.out / "points.parquet").num_rows == 8 * 60
     assert result.summary.n_valid == 8 - sum(refused)
+
+
+def test_a_scanner_with_a_process_of_its_own_is_asked(request_for, dive):
+    class Late(Scanner):
+        def process(self, frame):
+            scan = super().process(frame)
+            return replace(scan, time_s=scan.time_s + 1.0)
+
+    request = request_for(dive)
+    run(request, scanner_for=Late)
+    expected = [1.0 + i / 25 for i in range(8)]
+    assert [float(row["time_s"]) for row in rows(request.out)] == pytest.approx(expected)
 
 
 def test_the_run_file_tells_source_rig_and_options(request_for, dive):

@@ -68,6 +68,14 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
     A source that breaks off is no exception but the result's `fault`: what came before it has been
     measured and reported.
 
+    Parameters
+    ----------
+    request : RunRequest
+    scanner_for : callable
+        Makes the scanner from rig and options: a subclass of `Scanner`, or anything else whose
+        `process` takes a `Frame` and returns a `Scan`. Only `Scanner` itself uses several processes
+        and has its stripes in a recording.
+
     Raises
     ------
     AqualvsError

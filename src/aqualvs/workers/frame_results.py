@@ -211,7 +211,7 @@ class FrameProcessor:
         scanner = self._scanner
         if isinstance(scanner, RecordableScanner):
             return [scanner.process_with_inputs(frame) for frame in frames]
-        if not isinstance(scanner, Scanner):
+        if not isinstance(scanner, Scanner) or type(scanner).process is not Scanner.process:
             return [(scanner.process(frame), None) for frame in frames]
         # Step by step for all frames: code that has just run is still in the caches, from which
         # decoding and the other step would displace it.
