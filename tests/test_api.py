@@ -110,6 +110,12 @@ def test_a_request_takes_paths_as_text(tmp_path) -> None:
     assert (tmp_path / "run" / "posture.csv").is_file()
 
 
+def test_a_window_of_frames_begins_at_the_first() -> None:
+    window = importlib.import_module("aqualvs.results.run_request").FrameWindow
+    with pytest.raises(aqualvs.AqualvsError, match="first is -3; frames count from 0"):
+        window(-3, 2)
+
+
 def test_a_frame_that_does_not_fit_is_a_fault_of_input() -> None:
     scanner = aqualvs.Scanner(aqualvs.load_rig(files("aqualvs") / "data" / "demo" / "rig.yaml"))
     for luma in (np.zeros((10, 20), np.uint8), np.zeros((10, 20), np.float32)):

@@ -164,6 +164,11 @@ class FrameWindow:
     first: int = 0
     stop: int | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse frames before the first: raises `OptionError`."""
+        if self.first < 0:
+            raise OptionError(f"FrameWindow: first is {self.first}; frames count from 0")
+
     @classmethod
     def parse(cls, text: str) -> "FrameWindow":
         """Return the window that "A:B", "A:" or ":B" means.
@@ -200,9 +205,12 @@ class RunRequest:
     overwrite : bool
         Whether a run that is already there may be replaced.
     water : Water
+        Of `aqualvs.results.run_request`, such as `Water(temperature_c=12.0, salinity=35.0)`.
     no_dome : bool
         Leave refraction at the dome out, for comparison.
     frames : FrameWindow
+        Of `aqualvs.results.run_request`, such as `FrameWindow(100, 200)`; the whole source by
+        default.
     fps : float or None
         Frame rate of image folders.
     scanner : ScannerOptions
