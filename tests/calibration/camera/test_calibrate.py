@@ -141,6 +141,11 @@ def test_solves_a_fisheye_lens() -> None:
     assert found.noise_px == pytest.approx(0.1, rel=0.1)
 
 
+def test_a_model_that_does_not_fit_a_fisheye_lens_is_named() -> None:
+    with pytest.raises(CalibrationError, match=r"come to rest; try --model fisheye, or take more"):
+        camera(_shots(FISHEYE, n=10, distance=(0.12, 0.3)), SIZE)
+
+
 def test_outlying_corners_and_views_are_named() -> None:
     views, rng = _shots(), np.random.default_rng(5)
     views[3].pixels[:6] += rng.uniform(3.0, 9.0, (6, 2))

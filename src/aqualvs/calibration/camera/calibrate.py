@@ -111,7 +111,8 @@ def _check_determined(solution: Solution[BundleState], covariance: FloatArray) -
             f"uncertain); {remedy}"
         )
     if not solution.converged:
-        raise CalibrationError(f"the solve does not come to rest; {remedy}")
+        model = "" if rig.lens.model is LensModel.FISHEYE else "try --model fisheye, or "
+        raise CalibrationError(f"the solve does not come to rest; {model}{remedy}")
 
 
 def coverage(pixels: FloatArray, size_px: tuple[int, int]) -> IntArray:

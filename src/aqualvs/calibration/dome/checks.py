@@ -265,7 +265,7 @@ def check_shared_errors(
         text = (
             f"all given distances are {1e3 * offset.value:+.2f} ± {1e3 * offset.sigma:.2f} mm off "
             "together; they count from the dome's centre along its y axis, not from its front or "
-            "from the lens"
+            "from the lens; or the dome's radius is not that of the rig file"
         )
         fatal = abs(offset.value) > max_offset
     else:

@@ -86,7 +86,7 @@ def scale_fault(ratio: float, tolerance: float) -> str | None:
     return (
         f"the pictures put the boards {ratio:.4g} times as far apart as the given distances do; "
         f"measure the board's squares: square_mm would have to be {1.0 / ratio:.4g} times what "
-        "its file says, if the distances are right"
+        "its file says, if the distances are right, and camera and housing those of the rig file"
     )
 
 
