@@ -107,11 +107,11 @@ def test_a_rolling_picture_is_corrected_in_a_small_part_of_its_scan() -> None:
     with open_source(str(folder / "dive.mp4")) as source:
         frames = list(itertools.islice(source, 12))
     scanner, motion = Scanner(rig), RowMotion(rig)
-    scans = [scanner.process(frame) for frame in frames]
+    scans = [scanner.scan(frame)[1] for frame in frames]
 
     def scan() -> None:
         for frame in frames[2:]:
-            scanner.process(frame)
+            scanner.scan(frame)
 
     def correct() -> None:
         for i in range(2, len(scans)):

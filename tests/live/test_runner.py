@@ -139,7 +139,7 @@ def test_a_rolling_shutter_is_corrected_by_frames_of_the_past() -> None:
     scanner = Scanner(replace(demo_rig(), shutter=shutter))
     output = Collector()
     runner(list(demo_frames()), output, keep_every=True, scanner=scanner).run(never)
-    seen = [scanner.process(frame) for frame in demo_frames()]
+    seen = [scanner.scan(frame)[1] for frame in demo_frames()]
     motion = RowMotion(scanner.rig)
     for i, sample in enumerate(output.samples):
         expected = motion.correct(seen[i], seen[max(i - 2, 0) : i]).posture
@@ -172,7 +172,7 @@ def test_an_autopilot_tells_how_a_rolling_camera_turns() -> None:
     runner(list(demo_frames(3)), output, keep_every=True, scanner=scanner).run(never)
     assert output.asked_ns == [sample.posture_ns for sample in output.samples]
     first, motion = output.samples[0].scan, RowMotion(scanner.rig)
-    seen = scanner.process(demo_frames(1)[0])
+    _, seen = scanner.scan(demo_frames(1)[0])
     without = motion.correct(seen, []).posture
     expected = motion.correct(replace(seen, turning=first.turning), []).posture
     assert first.posture
