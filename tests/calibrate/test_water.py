@@ -28,8 +28,8 @@ def in_colour(light_nm):
 def calibrated(monkeypatch):
     """Calibrate the water for a rig, by a plate seen in green light."""
 
-    def run(rig, collect=list):
-        view = index_view(rig.in_water(index_in_seawater(*SEA, None, rig.n_air)))
+    def run(rig, collect=list, n=None):
+        view = index_view(rig.in_water(n or index_in_seawater(*SEA, None, rig.n_air)))
         monkeypatch.setattr(water, "detect_markers", lambda *_: view)
         width, height = rig.size_px
         pictures = collect([np.zeros((height, width), np.uint8)])
@@ -75,3 +75,9 @@ def test_for_green_lasers_it_is_what_the_plate_shows(calibrated):
 @pytest.mark.parametrize("collect", [iter, np.stack])
 def test_pictures_may_come_one_by_one_or_in_one_array(calibrated, collect):
     assert calibrated(example_rig(), collect).rig.n_water == calibrated(example_rig()).rig.n_water
+
+
+@pytest.mark.parametrize(("n", "said"), [(1.378, True), (1.31, True), (1.341, False)])
+def test_an_index_that_no_water_has_is_told(calibrated, n, said):
+    notes = calibrated(example_rig(), n=n).notes
+    assert any("not that of water" in note for note in notes) is said

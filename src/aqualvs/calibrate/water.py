@@ -118,10 +118,25 @@ def calibrate_water(
         uncertainty=result.uncertainty,
         residuals_px=result.residuals,
         left_out={**found.missed, **{one.name: one.refused for one in result.readings if not one}},
-        notes=(*found.notes, *result.remarks, *(step.text() for step in result.steps)),
+        notes=(
+            *found.notes,
+            *_not_water(seen.rig),
+            *result.remarks,
+            *(step.text() for step in result.steps),
+        ),
         solution=result,
         found=(found,),
     )
+
+
+def _not_water(rig: Rig) -> list[str]:
+    """Return a note if a rig's index, for green light, is that of neither water nor air."""
+    if 1.32 <= rig.n_water <= 1.36 or rig.is_air(rig.n_water):
+        return []
+    return [
+        f"the index {rig.n_water:.4f} is not that of water, which has 1.330 to 1.345 for green "
+        "light; is the target where target.yaml has it, and the lens where the rig file has it?"
+    ]
 
 
 def run_water(request: WaterRequest, echo: Echo) -> None:
