@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from benchmarks.random_scenes import Difficulty
 
+from aqualvs.geometry.transforms import SE3
 from aqualvs.nets.condition import NetCondition, NetStretch
 from aqualvs.nets.spectrum import Mesh
 from aqualvs.scanner import Scanner
 from aqualvs.simulation.scenarios import example_rig
+from aqualvs.simulation.scene import Net, Scene
 from aqualvs.sources import open_source
 from net_cases import NetCamera
 from net_dives import Dive, passed_holes, random_dive, true_solidity
@@ -71,6 +73,26 @@ def test_twine_is_mostly_right_by_a_fifth() -> None:
 def test_the_way_is_what_the_vehicle_went(which: tuple[int, Difficulty]) -> None:
     dive, stretch = rendered(*which)
     np.testing.assert_allclose(stretch.place, dive.velocity * dive.times[-1], atol=5e-3)
+
+
+@pytest.mark.parametrize("roll_deg", [-3.0, 3.0])
+def test_a_level_square_net_is_no_other(roll_deg: float) -> None:
+    """A slanting laser crosses both families in turn, which looks like a family of its own."""
+    net = Net(mesh="square", bar=0.015, twine=0.0015, roll=np.deg2rad(roll_deg))
+    dive = Dive(
+        scene=Scene(dome_from_scene=SE3.identity(), nets=(net,), target="net"),
+        fps=25.0,
+        n_frames=20,
+        range=(0.45, 0.48),
+        pitch=(0.0, 0.0),
+        yaw=(np.deg2rad(-5.0), np.deg2rad(3.0)),
+        phase=(0.0, 0.0),
+        velocity=np.array([0.125, 0.0]),
+    )
+    (stretch,) = NetCondition(RIG).add_all(quick_scans(dive, RIG))
+    assert stretch.lattice is not None
+    assert stretch.lattice.mesh is Mesh.FOUR_SIDED
+    assert stretch.lattice.bar == pytest.approx(net.bar, rel=0.01)
 
 
 def test_a_rendered_hole_is_found_and_nothing_else() -> None:

@@ -273,7 +273,12 @@ def _uneven(hypothesis: Hypothesis) -> float:
 def hypotheses(spectrum: Spectrum) -> list[Hypothesis]:
     """Return lattices that explain peaks of the spectrum; most of them are wrong."""
     size, angle, power = spectrum.polar()
-    return [*_four_sided(spectrum, size, angle, power), *_six_sided(spectrum, size, angle, power)]
+    gain = _family_gain(power, size, spectrum.per_frame, 0.5)
+    return [
+        *_squares(size, angle, gain),
+        *_four_sided(spectrum, size, angle, gain),
+        *_six_sided(spectrum, size, angle, power),
+    ]
 
 
 def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: float) -> FloatArray:
@@ -286,11 +291,22 @@ def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: f
     return gain
 
 
+def _squares(size: FloatArray, angle: FloatArray, gain: FloatArray) -> list[Hypothesis]:
+    """Return pairs of perpendicular families with one pitch, likely together.
+
+    A laser that crosses both families of a level net makes stronger waves of its own than either.
+    """
+    quarter = N_ANGLES // 2
+    both = gain[:, :quarter] + gain[:, quarter:]
+    waves = _best_waves(both, size, angle[:quarter], _SEARCH.kept)
+    turn = turned(np.pi / 2.0)
+    return [Hypothesis(Mesh.FOUR_SIDED, np.array([a, turn @ a])) for _, _, a in waves]
+
+
 def _four_sided(
-    spectrum: Spectrum, size: FloatArray, angle: FloatArray, power: FloatArray
+    spectrum: Spectrum, size: FloatArray, angle: FloatArray, gain: FloatArray
 ) -> list[Hypothesis]:
     """Return pairs of families: likely waves of the stronger one, and the best in the remainder."""
-    gain = _family_gain(power, size, spectrum.per_frame, 0.5)
     found = []
     # Number of frames in the search for second families.
     max_of_rest = 6
