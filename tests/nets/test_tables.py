@@ -228,12 +228,14 @@ def test_no_marker_of_the_map_points_to_one_side(folder):
         assert corners == {(-x, y) for x, y in corners}
 
 
+@pytest.mark.parametrize("diagonal", [False, True])
 @pytest.mark.parametrize(("bars", "warned"), [(0.35, False), (0.45, True), (1.2, True)])
-def test_a_motion_near_half_a_mesh_a_frame_is_warned_of(tmp_path, bars, warned):
-    """Along a family's normal: a four-sided net shifted by a bar looks the same."""
+def test_a_motion_near_half_a_mesh_a_frame_is_warned_of(tmp_path, diagonal, bars, warned):
+    """Along a family's normal, or between both: a net shifted by a bar looks the same."""
     one = stretch(0, (0.0, 0.0))
-    normal, pitch = one.lattice.normals[0], one.lattice.pitch[0]
-    way = bars * pitch * normal * (one.last_frame - one.first_frame)
+    first, second = one.lattice.normals[:2] * one.lattice.pitch[:2, None]
+    step = (first + second) / np.sqrt(2.0) if diagonal else first
+    way = bars * step * (one.last_frame - one.first_frame)
     wall, words = walled([stretch(0, way)]), "from frame to frame in 62 of 62 frames"
     assert (words in "\n".join(net_lines(wall, 1.0, 62))) == warned
     dive = make_dive(tmp_path / "run", video=False)

@@ -418,7 +418,7 @@ def _is_fast(stretch: NetStretch) -> bool:
         return False
     near_half = 0.4
     meshes = stretch.lattice.basis @ (stretch.place - stretch.begin_place) / n_steps
-    return bool(np.abs(meshes).max() > near_half)
+    return bool(np.hypot(*meshes) > near_half)
 
 
 def place_text(place: NetPlace) -> str:
