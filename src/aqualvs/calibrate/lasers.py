@@ -20,6 +20,7 @@ from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet
 from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.rigschema import LASER_NM, LASER_NM_REMEDY
@@ -74,6 +75,7 @@ class _Target(NamedTuple):
     surfaces: TargetSurfaces
     found: common.DetectedTargets
     n_medium: float  # Refractive index outside the dome.
+    marker_ids: IntArray | None = None  # Shape (M,): of a box's markers, as in its file.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,7 +159,8 @@ def calibrate_lasers(
             ),
             uncertainty=_camera_uncertainty(before, refine=refine, elsewhere=elsewhere),
         )
-    result = replace(result, warnings=(*_assumed(before), *result.warnings))
+    misplaced = [] if target.marker_ids is None else _misplaced(target.marker_ids, views, result)
+    result = replace(result, warnings=(*_assumed(before), *misplaced, *result.warnings))
     if len(result.lasers) != len(before.lasers):
         result = replace(result, rig=_with_wavelength(result.rig, wavelength_nm))
     solved = _solved_rig(before, result, target)
@@ -286,14 +289,36 @@ def _detected(
             lambda one, image: detect_markers(image, markers, one),
             common.path_text(box, "the box"),
         )
-        return _Target(
-            common.named(box, "the box"), surfaces, found, common.medium_index(medium, rig, default)
-        )
+        n_medium = common.medium_index(medium, rig, default)
+        return _Target(common.named(box, "the box"), surfaces, found, n_medium, markers.ids)
     assert board is not None
     found = common.detect_boards(pictures, board)
     n_medium = common.medium_index(medium, rig, rig.n_water)
     surface = board_surface(thickness=board_offset)
     return _Target(common.named(board, "the board"), surface, found, n_medium)
+
+
+def _misplaced(
+    marker_ids: IntArray, views: Sequence[LaserView], result: LaserCalibration
+) -> list[str]:
+    """Return a note on every marker that most pictures leave out, because others contradict it."""
+    # Least pictures that leave it out, and least share of those that show it.
+    min_pictures, min_share = 2, 0.5
+    used = {one.name: one.corners.ids[one.corner_inliers] for one in result.views}
+    seen, left_out = np.zeros((2, len(marker_ids)), np.int64)
+    for one in views:
+        if one.view.name not in used:
+            continue
+        n_seen = np.bincount(one.view.ids // 4, minlength=len(marker_ids))
+        n_used = np.bincount(used[one.view.name] // 4, minlength=len(marker_ids))
+        seen += n_seen > 0
+        left_out += 2 * n_used < n_seen
+    wrong = (left_out >= min_pictures) & (left_out > min_share * seen)
+    return [
+        f"marker {marker_ids[i]}: left out of {left_out[i]} of {seen[i]} pictures, where it does "
+        "not fit the others; check its place and number in the box's file"
+        for i in np.flatnonzero(wrong)
+    ]
 
 
 def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
