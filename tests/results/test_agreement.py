@@ -1,5 +1,6 @@
 """Do the lasers agree? Named where one has drifted, and silence where the target is bent."""
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 
@@ -81,6 +82,14 @@ def test_a_laser_that_has_turned_is_named(laser: int, towards: float, degrees: f
     # What is asked of it; stripe errors of 0.1 px make hundredths.
     assert np.rad2deg(verdict.angle) == pytest.approx(degrees, abs=0.1)
     assert f"laser {laser + 1} ({RIG.lasers[laser].name}) is off by" in verdict.sentence()
+
+
+@pytest.mark.parametrize("laser", [0, 1, 2])
+def test_a_laser_that_was_pushed_aside_is_off_by_millimetres(laser: int) -> None:
+    name = RIG.lasers[laser].name
+    pushed = rig_moved_by(RIG, (f"{name}:offset",), np.array([0.005]))
+    sentence = verdict_on(RIG, scans(pushed, RIG)).sentence()
+    assert re.search(rf"laser {laser + 1} \({name}\) is off by (4\.\d|5|5\.\d) mm", sentence)
 
 
 @pytest.mark.parametrize(("laser", "towards"), [(0, 0.0), (1, 0.0), (2, 1.57)])

@@ -431,6 +431,8 @@ class AgreementVerdict:
     # Turn of the first suspect and its standard deviation, in radians; NaN without suspects.
     angle: float = math.nan
     sigma_angle: float = math.nan
+    # Its shift along the normal of its plane, in metres; NaN without suspects.
+    shift: float = math.nan
     # Rms distance of its stripe from the targets, as a share of the range; NaN without suspects.
     effect: float = math.nan
     # Size of the picture over that of the rig's camera, less 1; 0 where it is not in doubt.
@@ -460,7 +462,10 @@ class AgreementVerdict:
             return f"{zoomed}: {settings}, or recalibrate with 'aqualvs calibrate camera'"
         pairs = zip(self.suspects, self.names, strict=True)
         named = " or ".join(f"laser {i + 1} ({name})" for i, name in pairs)
-        off = f"{named} is off by {math.degrees(self.angle):.2g} deg"
+        # A laser may be pushed aside without a turn.
+        turned = self.angle > 2.0 * self.sigma_angle
+        far = f"{math.degrees(self.angle):.2g} deg" if turned else f"{1e3 * abs(self.shift):.2g} mm"
+        off = f"{named} is off by {far}"
         remedy = "recalibrate with 'aqualvs calibrate lasers'"
         if self.state is AgreementState.DRIFTED:
             share = f"{self.effect:.1%} of the range"
@@ -594,6 +599,7 @@ class LaserAgreement:
             names=tuple(self._rig.lasers[i].name for i in numbers),
             angle=angle,
             sigma_angle=math.sqrt(float(tilt @ covariance[:2, :2] @ tilt)) / angle,
+            shift=float(best.step[2]),
             effect=best.effect,
             zoom=zoom,
         )
