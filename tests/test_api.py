@@ -110,6 +110,22 @@ def test_a_request_takes_paths_as_text(tmp_path) -> None:
     assert (tmp_path / "run" / "posture.csv").is_file()
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"water": 1.34}, "water is 1.34; give a Water of aqualvs.results.run_request"),
+        ({"frames": slice(0, 9)}, "frames is slice"),
+        ({"scanner": "ridge"}, "give a ScannerOptions of aqualvs.scanner"),
+        ({"n_processes": 0}, "n_processes is 0; use 1 or more"),
+        ({"n_processes": 1.5}, "n_processes is 1.5"),
+    ],
+)
+def test_options_of_another_type_are_refused_in_one_line(wrong, words) -> None:
+    with pytest.raises(aqualvs.AqualvsError, match=words) as refused:
+        aqualvs.RunRequest(source="dive.mp4", rig="rig.yaml", out="out", **wrong)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_window_of_frames_begins_at_the_first() -> None:
     window = importlib.import_module("aqualvs.results.run_request").FrameWindow
     with pytest.raises(aqualvs.AqualvsError, match="first is -3; frames count from 0"):

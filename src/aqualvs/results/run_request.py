@@ -257,7 +257,18 @@ class RunRequest:
     n_processes: int = 1
 
     def __post_init__(self) -> None:
-        """Take paths in any form that `Path` takes."""
+        """Take paths in any form that `Path` takes.
+
+        Raises `OptionError` if an option is of another type than stated.
+        """
+        kinds = {"water": Water, "frames": FrameWindow, "scanner": ScannerOptions}
+        for name, kind in kinds.items():
+            if not isinstance(value := getattr(self, name), kind):
+                raise OptionError(
+                    f"RunRequest: {name} is {value!r}; give a {kind.__name__} of {kind.__module__}"
+                )
+        if not isinstance(self.n_processes, int) or self.n_processes < 1:
+            raise OptionError(f"RunRequest: n_processes is {self.n_processes!r}; use 1 or more")
         object.__setattr__(self, "source", str(self.source))
         for name in ("rig", "out", "rerun", "truth", "index_target"):
             value = getattr(self, name)
