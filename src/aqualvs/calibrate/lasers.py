@@ -16,7 +16,7 @@ from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures
 from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, board_surface, box_surfaces
-from aqualvs.calibration.lasers.views import LaserView
+from aqualvs.calibration.lasers.views import LaserView, in_lasers_light
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet
 from aqualvs.errors import OptionError
@@ -34,6 +34,7 @@ from aqualvs.optics.solved import (
     with_step,
     with_uncertainty,
 )
+from aqualvs.optics.water import Dispersion
 from aqualvs.report.calibration_material import (
     CalibrationPage,
     LaserRow,
@@ -74,7 +75,7 @@ class _Target(NamedTuple):
     name: str  # In messages.
     surfaces: TargetSurfaces
     found: common.DetectedTargets
-    n_medium: float  # Refractive index outside the dome.
+    n_medium: float  # Refractive index outside the dome, for green or white light.
     marker_ids: IntArray | None = None  # Shape (M,): of a box's markers, as in its file.
 
 
@@ -82,7 +83,7 @@ class _Target(NamedTuple):
 class LasersResult(common.Calibration[LaserCalibration]):
     """Result of `calibrate_lasers`."""
 
-    n_medium: float  # Refractive index outside the dome in the pictures.
+    n_medium: float  # Refractive index outside the dome in the pictures, for the lasers' light.
     # Corners and stripes of every picture in which the target was found.
     views: tuple[LaserView, ...]
 
@@ -140,22 +141,30 @@ def calibrate_lasers(
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
     before = _with_wavelength(before, wavelength_nm)
     wavelength_nm = _wavelength(wavelength_nm, before)
-    target = _detected(pictures, before, box, board, medium, board_offset)
+    # A camera sees the target in green or white light, whatever the colour of the lasers.
+    light = Dispersion.of(wavelength_nm, before.n_air)
+    green = before.in_water(light.to_green(before.n_water))
+    target = _detected(pictures, green, box, board, medium, board_offset)
+    n_green, n_medium = target.n_medium, light.from_green(target.n_medium)
     common.check_same_size(before, target.found)
     views = tuple(
         LaserView(view, find_stripes(common.read_colour(picture), wavelength_nm))
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
-    elsewhere = medium is not None or before.is_air(target.n_medium)
+    seen = views
+    if light.ratio != 1.0:
+        cameras = before.in_water(n_green).camera(), before.in_water(n_medium).camera()
+        seen = tuple(in_lasers_light(one, *cameras) for one in views)
+    elsewhere = medium is not None or before.is_air(n_medium)
     if n_lasers is None:
         n_lasers = _planned_count(before) if names is None else len(names)
     with common.counting_missed(target.found):
         result = solve_lasers(
             before,
-            views,
+            seen,
             target.surfaces,
             options=LaserOptions(
-                n_lasers=n_lasers, n_medium=target.n_medium if elsewhere else None, refine=refine
+                n_lasers=n_lasers, n_medium=n_medium if elsewhere else None, refine=refine
             ),
             uncertainty=_camera_uncertainty(before, refine=refine, elsewhere=elsewhere),
         )
@@ -163,7 +172,7 @@ def calibrate_lasers(
     result = replace(result, warnings=(*_assumed(before), *misplaced, *result.warnings))
     if len(result.lasers) != len(before.lasers):
         result = replace(result, rig=_with_wavelength(result.rig, wavelength_nm))
-    solved = _solved_rig(before, result, target)
+    solved = _solved_rig(before, result, target._replace(n_medium=n_medium))
     return LasersResult(
         rig=solved if names is None else _with_names(solved, names),
         uncertainty=result.uncertainty,
@@ -172,7 +181,7 @@ def calibrate_lasers(
         notes=(*target.found.notes, *result.warnings),
         solution=result,
         found=(target.found,),
-        n_medium=target.n_medium,
+        n_medium=n_medium,
         views=views,
     )
 

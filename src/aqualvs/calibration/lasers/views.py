@@ -8,7 +8,7 @@ both are reported.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -92,6 +92,29 @@ class PlacedView:
     placed: PlacedStripes  # Stripe points on the target's surfaces.
     n_corners_rejected: int  # Number of outlier corners.
     rms_px: float  # Root mean square residual of the corners for the pose by them alone.
+
+
+def in_lasers_light(view: LaserView, green: Camera, camera: Camera) -> LaserView:
+    """Return a picture with its corners where light of the lasers would show them.
+
+    A target is seen in green or white light, which water bends otherwise than that of red or blue
+    lasers. Without a pose, the picture is returned as it is.
+
+    Parameters
+    ----------
+    view : LaserView
+        As seen.
+    green, camera : Camera
+        Into the medium of the pictures, for green light and for that of the lasers.
+    """
+    try:
+        pose = target_pose(green, view.view)
+    except CalibrationError:
+        return view
+    points = pose.dome_from_target.apply(view.view.points)
+    (there, there_valid), (here, here_valid) = camera.project(points), green.project(points)
+    shift = np.where((there_valid & here_valid)[:, None], there - here, 0.0)
+    return replace(view, view=replace(view.view, pixels=view.view.pixels + shift))
 
 
 def place_views(
