@@ -16,7 +16,7 @@ from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures
 from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, board_surface, box_surfaces
-from aqualvs.calibration.lasers.views import LaserView, in_lasers_light
+from aqualvs.calibration.lasers.views import LaserView, corners_in_lasers_light
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet
 from aqualvs.errors import OptionError
@@ -154,7 +154,7 @@ def calibrate_lasers(
     seen = views
     if light.ratio != 1.0:
         cameras = before.in_water(n_green).camera(), before.in_water(n_medium).camera()
-        seen = tuple(in_lasers_light(one, *cameras) for one in views)
+        seen = tuple(corners_in_lasers_light(one, *cameras) for one in views)
     elsewhere = medium is not None or before.is_air(n_medium)
     if n_lasers is None:
         n_lasers = _planned_count(before) if names is None else len(names)

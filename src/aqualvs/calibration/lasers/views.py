@@ -94,7 +94,7 @@ class PlacedView:
     rms_px: float  # Root mean square residual of the corners for the pose by them alone.
 
 
-def in_lasers_light(view: LaserView, green: Camera, camera: Camera) -> LaserView:
+def corners_in_lasers_light(view: LaserView, green: Camera, camera: Camera) -> LaserView:
     """Return a picture with its corners where light of the lasers would show them.
 
     A target is seen in green or white light, which water bends otherwise than that of red or blue
