@@ -110,9 +110,17 @@ def count_text(n: int, word: str, *, commas: bool = False) -> str:
     return f"{number} {word}" if n == 1 else f"{number} {word}s"
 
 
+def are_holes_searched(n_holes: int, area_m2: float | None) -> bool:
+    """Return whether holes were searched for, by their number and the area that was looked at.
+
+    A net whose mesh is not known has no place for them. Of older files the area may be unknown.
+    """
+    return n_holes > 0 or area_m2 != 0.0
+
+
 def hole_count(n_holes: int, area_m2: float) -> str:
     """Return the number of holes on an area of net as text: none of no area is no finding."""
-    if not n_holes and not area_m2:
+    if not are_holes_searched(n_holes, area_m2):
         return "not searched for holes"
     return "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"
 

@@ -19,6 +19,7 @@ from aqualvs.report.run_data import source_name
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, POSTURE_CSV, check_run_files
 from aqualvs.results.run_request import read_run_yaml
+from aqualvs.text import are_holes_searched
 from aqualvs.vehicle_logs import dive_start_utc
 
 _NAMED = re.compile(r"(?<!\d)(20\d\d)([-_.]?)(\d\d)\2(\d\d)(?!\d)")
@@ -155,9 +156,9 @@ class Survey:
 
     @property
     def searched(self) -> bool:
-        """Whether holes were searched for: a net whose mesh is not known has no place for them."""
-        looked = self.facts.get("summary", {}).get("area_m2")
-        return looked != 0.0 or len(self.holes.number) > 0
+        """Whether holes were searched for."""
+        area_m2 = self.facts.get("summary", {}).get("area_m2")
+        return are_holes_searched(len(self.holes.number), area_m2)
 
 
 def find_runs(folder: Path) -> list[Path]:

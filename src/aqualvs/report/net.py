@@ -13,7 +13,7 @@ from aqualvs.report.html import Card, Raw, data_url, folded, table, text
 from aqualvs.report.run_data import mapping
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
-from aqualvs.text import clock, count_text, signed, with_sign
+from aqualvs.text import are_holes_searched, clock, count_text, signed, with_sign
 
 _LONG_TABLE = 12
 _NONE = "–"
@@ -43,8 +43,8 @@ class NetTables:
 
     @property
     def searched(self) -> bool:
-        """Whether holes were searched for: a net whose mesh is not known has no place for them."""
-        return self.summary.get("area_m2") != 0.0 or bool(self.holes)
+        """Whether holes were searched for."""
+        return are_holes_searched(len(self.holes), self.summary.get("area_m2"))
 
 
 def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
@@ -69,7 +69,7 @@ def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
 
 def net_warnings(summary: Mapping[str, Any]) -> list[str]:
     """Return why places and holes of a net are not to be trusted, by its summary, or by none."""
-    if not any(summary.get(name) for name in ("track_slip_m", "track_breaks", "fast_frames")):
+    if not summary:
         return []
     # Imported here: it brings the evaluation of nets along, which few reports have.
     from aqualvs.nets.tables import track_warnings
