@@ -171,11 +171,10 @@ def in_lasers_light(
     rig: Rig, known: RigUncertainty, light: Dispersion
 ) -> tuple[Rig, RigUncertainty]:
     """Return a rig, and its uncertainty, whose index was found in green light, for its lasers'."""
-    scale = np.array([light.ratio if name == N_WATER else 1.0 for name in known.names])
+    index, scale = known.names.index(N_WATER), np.ones(len(known.names))
+    scale[index] = light.ratio
     covariance = known.covariance * np.outer(scale, scale)
-    if N_WATER in known.names:
-        index = known.names.index(N_WATER)
-        covariance[index, index] = light.sigma(rig.n_water, known.sigmas[N_WATER]) ** 2
+    covariance[index, index] = light.sigma(rig.n_water, known.sigmas[N_WATER]) ** 2
     there = rig.in_water(light.from_green(rig.n_water))
     return there, RigUncertainty(known.names, covariance)
 

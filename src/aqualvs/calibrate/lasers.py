@@ -152,7 +152,7 @@ def calibrate_lasers(
         for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
     seen = views
-    if light.ratio != 1.0:
+    if n_green != n_medium:
         cameras = before.in_water(n_green).camera(), before.in_water(n_medium).camera()
         seen = tuple(corners_in_lasers_light(one, *cameras) for one in views)
     elsewhere = medium is not None or before.is_air(n_medium)
@@ -172,7 +172,7 @@ def calibrate_lasers(
     result = replace(result, warnings=(*_assumed(before), *misplaced, *result.warnings))
     if len(result.lasers) != len(before.lasers):
         result = replace(result, rig=_with_wavelength(result.rig, wavelength_nm))
-    solved = _solved_rig(before, result, target._replace(n_medium=n_medium))
+    solved = _solved_rig(before, result, target.name, n_medium)
     return LasersResult(
         rig=solved if names is None else _with_names(solved, names),
         uncertainty=result.uncertainty,
@@ -330,7 +330,7 @@ def _misplaced(
     ]
 
 
-def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
+def _solved_rig(before: Rig, result: LaserCalibration, target: str, n_medium: float) -> Rig:
     """Return the solved rig with its covariance and a note of this step."""
     old = rig_uncertainty(before)
     new = [name for name in result.uncertainty.names if name not in old.names]
@@ -340,8 +340,8 @@ def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
         points=sum(figures.n_points for figures in result.lasers),
         rms_px=float(np.sqrt(np.mean([figures.rms_px**2 for figures in result.lasers]))),
         extras={
-            "target": target.name,
-            "n_medium": round(target.n_medium, 6),
+            "target": target,
+            "n_medium": round(n_medium, 6),
             "surfaces": sorted({s for figures in result.lasers for s in figures.surfaces}),
             "refined": result.refined,
             **({ASSUMED: assumed} if assumed else {}),

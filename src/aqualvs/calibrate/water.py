@@ -17,7 +17,7 @@ from aqualvs.errors import CalibrationError, check_options
 from aqualvs.optics.rig import Rig, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import SolvedStep, rig_uncertainty, with_step, with_uncertainty
-from aqualvs.optics.water import Dispersion
+from aqualvs.optics.water import Dispersion, may_be_water
 from aqualvs.report.calibration_material import (
     CalibrationPage,
     Series,
@@ -131,7 +131,7 @@ def calibrate_water(
 
 def _not_water(rig: Rig) -> list[str]:
     """Return a note if a rig's index, for green light, is that of neither water nor air."""
-    if 1.32 <= rig.n_water <= 1.36 or rig.is_air(rig.n_water):
+    if may_be_water(rig.n_water) or rig.is_air(rig.n_water):
         return []
     return [
         f"the index {rig.n_water:.4f} is not that of water, which has 1.330 to 1.345 for green "

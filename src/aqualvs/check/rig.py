@@ -43,6 +43,7 @@ from aqualvs.optics.solved import (
     rig_uncertainty,
     solved_steps,
 )
+from aqualvs.optics.water import may_be_water
 from aqualvs.scanning.plane_search import MIN_FACING
 from aqualvs.text import Finding, Severity, count_text
 
@@ -355,7 +356,7 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
 
 def _check_water(rig: Rig) -> Finding:
     n = rig.n_water
-    if 1.32 <= n <= 1.36:
+    if may_be_water(n):
         # Quan & Fry at 532 nm: fresh 1.334 to 1.336, sea (35 per mille) 1.340 to 1.343.
         fresh, sea = 1.330 <= n < 1.3375, 1.3375 <= n <= 1.345
         name = "fresh" if fresh else "sea" if sea else "unusual, but possible,"

@@ -140,6 +140,11 @@ def water_fault(temperature_c: float | None, salinity_permille: float | None) ->
     return ("", "") if 0.0 < salinity_permille <= _SALTIEST else ("salinity", remedy)
 
 
+def may_be_water(n: float) -> bool:
+    """Return whether an index may be that of water: 1.330 to 1.345 for green light, with margin."""
+    return 1.32 <= n <= 1.36
+
+
 class Dispersion(NamedTuple):
     """Index of water for light of one wavelength, by that for green or white light.
 
@@ -173,11 +178,11 @@ class Dispersion(NamedTuple):
 
     def from_green(self, n_green: float) -> float:
         """Return the index at the wavelength."""
-        return self.n_air + self.ratio * (n_green - self.n_air)
+        return n_green + (self.ratio - 1.0) * (n_green - self.n_air)
 
     def to_green(self, n: float) -> float:
         """Return the index for green light in water that has the index `n` at the wavelength."""
-        return self.n_air + (n - self.n_air) / self.ratio
+        return n + (1.0 / self.ratio - 1.0) * (n - self.n_air)
 
     def sigma(self, n_green: float, sigma_green: float) -> float:
         """Return the standard deviation of `from_green`, where `n_green` has `sigma_green`."""
